@@ -1,7 +1,5 @@
 """Comparison of scenes Gaussian by Gaussian, and scripts that run other programs."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Packages of npm and the scene that other programs exchange."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

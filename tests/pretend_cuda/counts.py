@@ -1,7 +1,5 @@
 """Counters of the simulated device's work, by the line of the project's code that caused it."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from dataclasses import dataclass, field

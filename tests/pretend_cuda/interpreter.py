@@ -1,7 +1,5 @@
 """Replacement of Triton kernels by PyTorch in tests of other code, because Triton's interpreter is slow."""
 
-from __future__ import annotations
-
 import pytest
 
 from sgsst_core.features import layers, statistics

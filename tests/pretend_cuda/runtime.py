@@ -27,26 +27,6 @@ class Stream:
     def __init__(self, *_: Any, **__: Any) -> None:
         self.device = device.DEVICE
 
-    def wait_event(self, event: Event) -> None:
-        """Do nothing: all operations are already complete."""
-
-    def wait_stream(self, stream: Stream) -> None:
-        """Do nothing: all operations are already complete."""
-
-    def record_event(self, event: Event | None = None) -> Event:
-        """Record an event and return it."""
-        event = event or Event()
-        event.record(self)
-        return event
-
-    def synchronize(self) -> None:
-        """Count a host synchronization."""
-        device.wait()
-
-    def query(self) -> bool:
-        """Return whether all work is complete."""
-        return True
-
 
 class Event:
     """Event that records a time of the host's clock."""
@@ -54,16 +34,12 @@ class Event:
     def __init__(self, enable_timing: bool = False, blocking: bool = False, **_: Any) -> None:
         self._timed = enable_timing
         self._moment: float | None = None
-        self.read = False
 
     def record(self, stream: Stream | None = None) -> None:
         """Record the current time."""
         if self._timed:
             device.refuse_in_capture("an event with timing")
         self._moment = time.perf_counter()
-
-    def wait(self, stream: Stream | None = None) -> None:
-        """Do nothing, because the stream waits, not the host."""
 
     def query(self) -> bool:
         """Return whether the event has been recorded."""

@@ -1,8 +1,7 @@
-"""Tests of whole jobs on a simulated CUDA device: steps need few synchronizations, copies and launches."""
-
-from __future__ import annotations
+"""Tests of jobs on a simulated CUDA device: steps need few synchronizations and launches, and memory may run out."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,19 +9,20 @@ from typing import Any
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
 from sgsst_core.bench import device_checks
-
-if torch.cuda.is_available():
-    pytest.skip("there is a GPU, on which the tests marked gpu run", allow_module_level=True)
-
 from sgsst_core.budget import memory_for
+from sgsst_core.errors import DeviceMemoryError
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests import networks
 from tests.pretend_cuda.counts import Counts
+from tests.pretend_cuda.interpreter import leave_out_kernels
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall, write_files
 from worker.execute import execute
@@ -32,6 +32,8 @@ from worker.options import StyleFile, region_options, region_requests
 from worker.prepare import Job, dry_run, prepare
 from worker.run import Listener
 
+if torch.cuda.is_available():
+    pytest.skip("there is a GPU, on which the tests marked gpu run", allow_module_level=True)
 pytest.importorskip("triton")
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
@@ -106,16 +108,6 @@ def test_job_runs_resumes_and_reports(
 
 
 @pytest.mark.slow
-def test_float16_job_follows_one_in_float32(counts: Counts, tmp_path: Path) -> None:
-    losses = {}
-    for precision in ("float16", "float32"):
-        stylizer = prepare(request_(tmp_path / precision, precision=precision)).stylizer
-        losses[precision] = [stylizer.run_step().loss for _ in range(stylizer.job.total_steps)]
-        assert stylizer.job.network.precision == stylizer.job.plan.precision == precision
-    assert losses["float16"] == pytest.approx(losses["float32"], rel=0.1)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("scan", "gray"), [(False, False), (True, True)])
 def test_steady_step_synchronizes_once_and_copies_scalars(
     counts: Counts, tmp_path: Path, scan: bool, gray: bool
@@ -178,25 +170,6 @@ def in_regions(asked: JobSpec) -> JobSpec:
 
 
 @pytest.mark.slow
-def test_regions_need_no_additional_synchronization(counts: Counts, tmp_path: Path) -> None:
-    stylizer = prepare(in_regions(request_(tmp_path, size=(64, 48), steps_coarse=2, steps_sos=4))).stylizer
-    assert stylizer.job.plan.device == "cuda"
-    assert stylizer.job.regions is not None
-    frozen, before = stylizer.job.regions.frozen[stylizer.job.plan.seen], stylizer.sh_dc.detach().cpu().clone()
-    seen: set[int] = set()
-    for _ in range(stylizer.job.total_steps):
-        counts.clear()
-        record = stylizer.run_step()
-        first = record.view not in seen
-        seen.add(record.view)
-        assert 1 <= counts.waits.total() <= 1 + first, counts.waits
-        assert counts.copies.total() <= SCALARS * (1 + first), counts.copies
-    after = stylizer.sh_dc.detach().cpu()
-    assert torch.equal(after[frozen].view(torch.int32), before[frozen].view(torch.int32))
-    assert bool((after[~frozen] != before[~frozen]).any(dim=1).all())
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("scan", [False, True])
 def test_step_launches_fewer_than_500_kernels(counts: Counts, scan: bool) -> None:
     """The larger network, VGG19, takes fewer than 500 launches on three scales, for views of any size.
@@ -235,15 +208,72 @@ def test_losses_match_cpu(tmp_path: Path, regions: bool) -> None:
     assert expected.job.plan.device == "cpu"
 
 
-@pytest.mark.slow
-def test_doctor_describes_the_gpu(counts: Counts) -> None:
-    assert device_checks._gpu().text.startswith("1 x pretend, compute capability 9.0, CUDA ")
-    assert device_checks._memory(torch.device("cuda", 0)).text == "jobs plan with 105.2 GB of the GPU's memory"
-    assert device_checks._precision().text == "jobs use float16; possible: float32, float16, bfloat16, tf32"
-
-
 def test_doctor_explains_why_a_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "exists", lambda path: str(path) == "/dev/nvidia0")
     finding = device_checks._gpu()
     assert finding.state == "warning"
     assert ("built for CPUs only" if torch.version.cuda is None else "PyTorch cannot use it") in finding.text
+
+
+#: A view has 64 x 320 pixels; the largest of its tiles has 64 x 192, including halos.
+WIDTH, HEIGHT, TILE = 320, 64, 192
+
+
+class Memory:
+    """Memory of the simulated GPU, with space for the activations of this many pixels."""
+
+    def __init__(self) -> None:
+        self.pixels = 1 << 30
+        self.failures = 0
+
+    def check(self, x: Tensor) -> None:
+        if x.shape[2] * x.shape[3] > self.pixels:
+            self.failures += 1
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+
+
+@pytest.fixture
+def memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[Memory]:
+    simulated, convolve = Memory(), FeatureNetwork._convolve
+
+    def convolve_within(network: FeatureNetwork, x: Tensor, step: Any) -> Tensor:
+        simulated.check(x)
+        return convolve(network, x, step)
+
+    leave_out_kernels(monkeypatch)
+    monkeypatch.setattr(FeatureNetwork, "_convolve", convolve_within)
+    with pretend_cuda():
+        yield simulated
+
+
+def planned(weights: BackboneWeights, **values: Any) -> Stylizer:
+    values = {"coarsest_side": 16, "position_weights": "off", "scale_sampling": 1, "precision": "float32", **values}
+    settings = make_settings(steps_coarse=0, steps_sos=3, **values)
+    return Stylizer.planned(
+        wall(10, 8), cameras(1, WIDTH, HEIGHT), style(), settings, weights=weights, rasterizer="cpu"
+    )
+
+
+def test_job_continues_with_half_of_its_activations(memory: Memory, tiny_weights: BackboneWeights) -> None:
+    expected, actual = planned(tiny_weights), planned(tiny_weights)
+    assert len(expected.job.loss.tiling.tiles((HEIGHT, WIDTH))) == 1
+    for step in range(3):
+        memory.pixels = 1 << 30
+        loss = expected.run_step().loss
+        if step:
+            memory.pixels = TILE * HEIGHT
+        assert actual.run_step().loss == pytest.approx(loss, rel=1e-4)
+    assert memory.failures == 1
+    assert len(actual.job.loss.tiling.tiles((HEIGHT, WIDTH))) > 1
+    assert actual.step == 3
+    torch.testing.assert_close(actual.sh_dc.cpu(), expected.sh_dc.cpu(), rtol=1e-3, atol=1e-4)
+
+
+def test_too_little_memory_is_a_clear_error(memory: Memory, tiny_weights: BackboneWeights) -> None:
+    stylizer = planned(tiny_weights)
+    before, memory.pixels = stylizer.sh_dc.cpu().clone(), 100
+    with pytest.raises(DeviceMemoryError, match=r"not even with half .* smaller --memory-limit than 105\.2 GB"):
+        stylizer.run_step()
+    assert memory.failures == 2
+    assert stylizer.step == 0
+    assert torch.equal(stylizer.sh_dc.cpu(), before)

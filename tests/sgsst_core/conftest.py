@@ -1,7 +1,5 @@
 """Fixtures of all tests of the core."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

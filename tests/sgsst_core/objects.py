@@ -1,7 +1,5 @@
 """Synthetic scenes for tests of orbits, with y pointing down as in captured scenes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Small synthetic scenes and cameras for tests of rasterizers."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -96,8 +94,3 @@ def pixels_like(view: Camera, seed: int = 6) -> Tensor:
 def is_cached(rasterizer: Rasterizer, view: Camera) -> bool:
     """Return whether a view has cached blend weights."""
     return camera_key(view) in rasterizer.caches["weights"]
-
-
-def has_intersections(rasterizer: Rasterizer, view: Camera) -> bool:
-    """Return whether a view's tile intersections are cached."""
-    return camera_key(view) in rasterizer.caches["intersections"]

@@ -1,7 +1,5 @@
 """Synthetic images with smooth structure and some texture, so that features are neither zero nor noise."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

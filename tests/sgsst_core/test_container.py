@@ -1,7 +1,5 @@
 """Tests of memory and cores of a container, with the files of control groups in a folder."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,11 +1,8 @@
-"""Tests of the environment that the package sets for PyTorch: its allocator, huge pages, and waiting threads."""
-
-from __future__ import annotations
+"""Tests of the environment that the package sets for PyTorch: its allocator, and waiting threads."""
 
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -32,33 +29,6 @@ def test_segments_can_grow_unless_the_user_configures_the_allocator(
     assert done.stdout.strip() == str(given or {"PYTORCH_ALLOC_CONF": "expandable_segments:True"})
 
 
-_ENABLED = Path("/sys/kernel/mm/transparent_hugepage/enabled")
-_HUGE_PAGES = """
-import sgsst_core
-from sgsst_core.features.vgg import FeatureNetwork
-import torch
-large = torch.ones(1 << 25)
-print(next(line.split()[1] for line in open("/proc/self/smaps_rollup") if line.startswith("AnonHugePages")))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("switch", ["0", None])
-def test_large_tensors_use_huge_pages(switch: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The user's environment variables take precedence over the default."""
-    if not _ENABLED.exists() or "[madvise]" not in _ENABLED.read_text():
-        pytest.skip("this system gives no huge pages, or gives them to everybody")
-    monkeypatch.delenv("THP_MEM_ALLOC_ENABLE", raising=False)
-    if switch is not None:
-        monkeypatch.setenv("THP_MEM_ALLOC_ENABLE", switch)
-    done = subprocess.run([sys.executable, "-c", _HUGE_PAGES], stdout=subprocess.PIPE, text=True, check=True)
-    kilobytes = int(done.stdout)
-    assert kilobytes == 0 if switch == "0" else kilobytes > 0
-
-
-MODULES = ("api.cli.main", "service.scheduling.attempt_process", "service.inspection.process", "worker.ranks.rank")
-
-
 def spin_count(module: str) -> str:
     """Return the spin count that OpenMP reads in a process that imports a module, then PyTorch."""
     code = f"import {module}, torch"
@@ -76,9 +46,7 @@ def _variables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_DISPLAY_ENV", "VERBOSE")
 
 
-@pytest.mark.parametrize(
-    "module", ["sgsst_core", *(pytest.param(module, marks=pytest.mark.slow) for module in MODULES)]
-)
+@pytest.mark.parametrize("module", ["sgsst_core", pytest.param("worker.ranks.rank", marks=pytest.mark.slow)])
 def test_waiting_threads_spin_briefly(module: str) -> None:
     assert spin_count(module) == "1000"
 

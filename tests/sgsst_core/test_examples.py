@@ -1,7 +1,5 @@
 """Run the examples in the docstrings of the library's public functions, on files in the current folder."""
 
-from __future__ import annotations
-
 import doctest
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of orbits: subject, up direction, rings of cameras, choice."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace
@@ -28,8 +26,6 @@ from sgsst_core.orbit import (
     middle_of,
     orbit,
     orbit_decisions,
-    quantile,
-    spread_directions,
     turntable,
 )
 from sgsst_core.planning.survey import survey_views
@@ -37,12 +33,7 @@ from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import make_settings
-from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs
-from sgsst_core.stylizing.planner import plan_job
 from tests.sgsst_core.objects import UP, ball, box, figure, ground, joined, moved, scene_of
-from tests.small_scenes import style
 
 OBJECT = scene_of(box((-0.5, -1.5, -0.3), (0.5, 1.5, 0.3), 3000))
 
@@ -94,48 +85,12 @@ def test_two_separate_objects_both_belong_to_the_subject() -> None:
     assert float(extent(joined(OBJECT, other))[1, 0]) > 3.0
 
 
-@pytest.mark.parametrize(
-    "scene",
-    [
-        scene_of(torch.ones(1, 3)),
-        scene_of(torch.ones(1, 3), opacities=torch.tensor([-100.0])),
-        scene_of(torch.ones(500, 3)),
-        scene_of(torch.ones(500, 3), 1e-30),
-        scene_of(torch.rand(7, 3), opacities=torch.full((7,), -300.0)),
-        scene_of(torch.rand(50, 3) * 1e15, 1e12),
-        scene_of(torch.rand(50, 3) * 1e-15, 1e-20),
-    ],
-)
-def test_degenerate_scenes_have_a_finite_extent_that_contains_them(scene: object) -> None:
-    subject = find_subject(scene)  # type: ignore[arg-type]
-    assert bool(torch.isfinite(subject.hull).all())
-    assert bool(torch.isfinite(subject.weights).all())
-    assert float(subject.weights.sum()) == pytest.approx(1)
-    assert len(subject.points)
-
-
-def test_zero_quaternion_counts_as_no_rotation() -> None:
-    scene = scene_of(OBJECT.means)
-    scene.quats[0] = 0
-    assert torch.allclose(extent(scene), extent(OBJECT))
-
-
 def test_subject_of_a_large_scene_is_estimated_from_a_sample() -> None:
     scene = figure()
     times = -(-150_000 // len(scene))
     many = joined(*[scene] * times)
     assert torch.allclose(extent(many), extent(scene), atol=0.02)
     assert len(find_subject(many).points) <= 20_000
-
-
-def test_quantiles_are_weighted_and_directions_spread() -> None:
-    values, weights = torch.tensor([3.0, 1.0, 2.0]), torch.tensor([1.0, 1.0, 2.0])
-    assert [quantile(values, weights, fraction) for fraction in (0.0, 0.25, 0.5, 0.75, 1.0)] == [1, 1, 2, 2, 3]
-    directions = spread_directions(300)
-    assert torch.allclose(directions.norm(dim=1), torch.ones(300, dtype=torch.float64))
-    nearest = (directions @ directions.T - 2 * torch.eye(300)).amax(1).clamp(max=1).acos()
-    assert math.degrees(float(nearest.amax())) < 15
-    assert float(directions.mean(0).norm()) < 0.01
 
 
 ROTATIONS = [
@@ -303,28 +258,6 @@ def test_up_snaps_to_a_close_world_axis_only() -> None:
     assert float(slanted.direction.norm()) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("quarters", range(4))
-def test_stick_may_stand_or_lie_and_a_foot_is_certain(quarters: int) -> None:
-    rotation = Rotation.from_euler("z", 90 * quarters, degrees=True)
-    stick = up_of(moved(scene_of(box((-0.2, -1, -0.2), (0.2, 1, 0.2), 4000)), rotation, 1.0))
-    assert not stick.sure
-    assert stick.candidates == (["x", "-y"] if quarters % 2 else ["-y", "y"])
-    standing = up_of(moved(figure(), rotation, 1.0))
-    assert standing.candidates == [["-y", "x", "y", "-x"][quarters]]
-
-
-def test_pieces_are_the_same_in_a_mirror() -> None:
-    """Crumbs lie at many distances around a box, about a cell of the grid from each other."""
-    generator = torch.Generator().manual_seed(4)
-    crumbs = (torch.rand(60, 3, generator=generator) - 0.5) * torch.tensor([2.0, 1.3, 0.7]) * 1.6
-    points = torch.cat(
-        [box((-0.5, -0.4, -0.2), (0.5, 0.4, 0.2), 3000), *(crumbs + 0.002 * index for index in range(30))]
-    )
-    subject, mirrored = (find_subject(scene_of(each)) for each in (points, -points))
-    assert 0 < subject.left_out == pytest.approx(mirrored.left_out)
-    assert len(subject.points) == len(mirrored.points)
-
-
 PIXELS = RESOLUTION**2 * 3 / 4
 ROTATION = Rotation.from_euler("xyz", [40, 65, -130], degrees=True)
 
@@ -487,23 +420,6 @@ def test_invalid_orbit_arguments_are_refused(wrong: dict[str, object]) -> None:
     arguments = {"count": 3} | wrong
     with pytest.raises(SettingsError):
         orbit(scene_of(torch.rand(9, 3)), **arguments)  # type: ignore[arg-type]
-
-
-def fill(scene: Scene, views: list[Camera]) -> list[float]:
-    """Return the fraction of each view's pixels that the scene covers."""
-    rasterizer = make_rasterizer("cpu", scene, max_intersection_bytes=0)
-    return [float(rasterizer.coverage(resized(view, 256)).mean()) for view in views]
-
-
-def test_statue_fills_its_portrait_views(shared_data: Path) -> None:
-    scene = read_scene(shared_data / "scenes" / "statues" / "narcissus.sog").scene
-    views = orbit(scene, 8, elevations=[10.0, 40.0])
-    shares = fill(scene, views)
-    assert sum(shares) / len(shares) > 0.5
-    assert min(shares) > 0.45
-    assert all(view.height > 1.5 * view.width for view in views)
-    for view in views:
-        assert float(in_view(view, scene.means).double().mean()) > 0.9999
 
 
 def test_turntable_keeps_focal_length_target_and_frame_and_shows_all_of_the_object() -> None:
@@ -689,33 +605,8 @@ def test_degenerate_scenes_have_an_automatic_orbit(scene: Scene) -> None:
         assert 0 <= orbit.shown <= 1 + 1e-9
 
 
-def test_plan_starts_with_the_lines_about_the_orbit(tiny_weights) -> None:  # type: ignore[no-untyped-def]
-    scene = figure()
-    orbit = make_orbit(scene, OrbitRequest(count=3))
-    cameras = [resized(camera, 64) for camera in orbit.cameras]
-    plan = plan_job(
-        JobInputs(scene, cameras, Style.of(style()), make_settings(), weights=tiny_weights, orbit=orbit)
-    ).plan
-    assert [decision.item for decision in plan.decisions[:3]] == ["up", "cameras", "frames"]
-    without = plan_job(JobInputs(scene, cameras, Style.of(style()), make_settings(), weights=tiny_weights)).plan
-    assert "up" not in {decision.item for decision in without.decisions}
-
-
 def test_automatic_orbits_are_deterministic() -> None:
     first, second = (make_orbit(figure(), OrbitRequest(count=12)) for _ in range(2))
     for one, other in itertools.zip_longest(first.cameras, second.cameras):
         assert torch.equal(one.world_to_camera, other.world_to_camera)
         assert (one.width, one.height, one.fx) == (other.width, other.height, other.fx)
-
-
-@pytest.mark.parametrize(
-    ("name", "reason"), [("statues/narcissus.sog", "foot"), ("playbot_synthetic_sh2/point_cloud.ply", "flat layer")]
-)
-def test_real_object_scans_stand_upright(shared_data: Path, name: str, reason: str) -> None:
-    scene = read_scene(shared_data / "scenes" / name).scene
-    orbit = make_orbit(scene, OrbitRequest(count=12))
-    assert orbit.up.name == "-y"
-    assert orbit.up.sure
-    assert reason in orbit.up.reason
-    assert orbit.outside < 0.01
-    assert orbit.hidden == 0

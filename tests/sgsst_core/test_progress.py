@@ -1,7 +1,5 @@
 """Tests of what a job shows: progress, progress bars and numbers."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tests of splitting Gaussians, and of choosing which to split."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -15,27 +13,20 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sgsst_core import refine as module
-from sgsst_core.constants import EPS2D
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.projection import Column, project
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import (
     MAX_PIECES,
     SIZES,
     STROKE_SIZE,
-    Footprints,
     Refinement,
-    axes_in_view,
     can_be_split,
-    candidates,
     choose_pieces,
     finest_size,
     max_children,
     mixture_error,
     parents_of,
     piece_counts,
-    pieces_to,
     ratio_of,
     refine_decision,
     split,
@@ -44,7 +35,7 @@ from sgsst_core.refine import (
 from sgsst_core.scene.gaussians import TENSORS, Scene, unit_rotations
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from sgsst_core.settings import make_settings
-from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose, single
+from tests.sgsst_core.splat_scenes import camera, cloud, single
 
 NUMBERS = [1, *range(3, MAX_PIECES + 1)]
 
@@ -177,21 +168,6 @@ def test_split_gaussian_looks_like_its_parent(opacity: float, least: float) -> N
     assert -10 * math.log10(error) > least
 
 
-def test_lengths_are_split_to_a_size_with_the_fewest_pieces() -> None:
-    lengths = torch.tensor([[1.0, 5.0, 0.0], [3.0, 1e9, torch.inf], [2.0, 2.0 + 1e-9, 4.0]], dtype=torch.float64)
-    pieces = pieces_to(lengths, 2.0)
-    assert pieces.dtype == torch.uint8
-    assert pieces[:, 0].tolist() == [1, 4, 1]
-    assert pieces[1, 1:].tolist() == [MAX_PIECES, MAX_PIECES]
-    assert pieces[2].tolist() == [1, 3, 5]
-    generator = torch.Generator().manual_seed(0)
-    some = 20 * torch.rand(200, 3, generator=generator, dtype=torch.float64)
-    for length, number in zip(some.flatten().tolist(), pieces_to(some, 2.0).flatten().tolist(), strict=True):
-        assert length / ratio_of(number) <= 2.0
-        fewer = NUMBERS[NUMBERS.index(number) - 1] if number > 1 else None
-        assert fewer is None or length / ratio_of(fewer) > 2.0
-
-
 def test_children_inherit_stored_harmonics(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene.ply", cloud(300, degree=3))
     pieces = torch.ones(300, 3, dtype=torch.uint8)
@@ -204,51 +180,6 @@ def test_children_inherit_stored_harmonics(tmp_path: Path) -> None:
     part = stored.sh_rest[some]
     assert isinstance(part, StoredHarmonics)
     assert torch.equal(held(part), held(plain.sh_rest)[some])
-
-
-def test_projected_axes_add_up_to_the_projected_covariance() -> None:
-    scene, view = cloud(300), camera(pose=rotated_pose())
-    projection = project(scene, view)
-    rows = torch.from_numpy(projection.gaussians).long()
-    x, y = (torch.from_numpy(projection.values[:, column]) for column in (Column.X, Column.Y))
-    inside = (x > 0) & (x < view.width) & (y > 0) & (y < view.height)  # outside the view, directions are clamped
-    lengths, reach = axes_in_view(scene, rows[inside], view)
-    reference = ReferenceRasterizer(scene)
-    assert reference.dtype == torch.float64
-    # Extents are t sqrt(p) and t sqrt(r) with the same t; without blur, the squared axes sum to p + r.
-    support = torch.from_numpy(projection.values[:, Column.LOG2_OPACITY]).double()[inside] + torch.log2(
-        torch.tensor(255.0)
-    )
-    t = (2 * torch.log(torch.tensor(2.0, dtype=torch.float64)) * support).sqrt()
-    extents = [
-        torch.from_numpy(projection.values[:, column])[inside] / t for column in (Column.EXTENT_X, Column.EXTENT_Y)
-    ]
-    expected = extents[0].square() + extents[1].square() - 2 * EPS2D
-    assert len(expected) > 50
-    assert torch.allclose(lengths.square().sum(dim=1), expected, rtol=1e-5, atol=1e-5)
-    depth = (scene.means.double() @ view.world_to_camera[2, :3].double() + view.world_to_camera[2, 3])[rows[inside]]
-    assert torch.allclose(reach, scene.scales[rows[inside]].double().exp().amax(dim=1) / depth)
-
-
-def test_footprints_are_means_weighted_by_visibility() -> None:
-    scene, views = cloud(200), [camera(pose=rotated_pose()), camera(40, 30, focal=30.0)]
-    rasterizer, prints = CpuRasterizer(scene), Footprints(scene)
-    weights = [rasterizer.survey(view)[1] for view in views]
-    for view, own in zip(views, weights, strict=True):
-        prints.add(view, own)
-    total = weights[0].double() + weights[1].double()
-    assert torch.equal(prints.weights, total)
-    both = ((weights[0] > 0) & (weights[1] > 0)).nonzero()[:, 0]
-    assert len(both) > 5
-    squares = sum(
-        own[both].double()[:, None] * axes_in_view(scene, both, view)[0].square()
-        for view, own in zip(views, weights, strict=True)
-    )
-    assert torch.allclose(prints.lengths[both], (squares / total[both, None]).sqrt())
-    assert bool((prints.lengths[total == 0] == 0).all())
-    other = Footprints(scene)
-    other.replace(*prints.sums)
-    assert torch.equal(other.lengths, prints.lengths)
 
 
 @settings(max_examples=60, deadline=None)
@@ -299,28 +230,6 @@ def test_gaussians_that_disagree_most_are_split_first_within_the_budget() -> Non
 )
 def test_finest_size_is_that_of_the_strokes_of_the_finest_scale(values: dict[str, Any], size: float) -> None:
     assert finest_size(make_settings(**values)) == size
-
-
-def test_gaussians_are_split_down_to_the_finest_size_only() -> None:
-    lengths = torch.tensor([[3.0, 0.1, 0.1], [40.0, 0.1, 0.1]], dtype=torch.float64)
-    one, cancels = torch.ones(2, dtype=torch.bool), torch.ones(2, dtype=torch.float64)
-    pieces, size = choose_pieces(lengths, one, cancels, 1000 * cancels, 1000, STROKE_SIZE)
-    assert size == STROKE_SIZE
-    assert piece_counts(pieces)[0] == 1
-    assert 40 / ratio_of(int(pieces[1, 0])) <= STROKE_SIZE < 40 / ratio_of(int(pieces[1, 0]) - 1)
-    finer, _ = choose_pieces(lengths, one, cancels, 1000 * cancels, 1000)
-    assert bool((piece_counts(finer) > piece_counts(pieces)).all())
-
-
-def test_faint_uniform_or_close_gaussians_are_not_candidates() -> None:
-    prints = Footprints(cloud(5))
-    prints.weights = torch.tensor([100.0, 1.0, 100.0, 100.0, 100.0], dtype=torch.float64)
-    prints.reach = torch.tensor([0.1, 0.1, 1.9, 0.1, 0.1], dtype=torch.float64)
-    magnitude = torch.ones(5, dtype=torch.float64)
-    cancels = torch.tensor([0.9, 0.9, 0.9, 0.01, 0.9], dtype=torch.float64)
-    splittable = torch.tensor([True, True, True, True, False])
-    assert candidates(prints, splittable, cancels, magnitude).tolist() == [True, False, False, False, False]
-    assert not candidates(prints, splittable, torch.zeros(5), torch.zeros(5)).any(), "no gradient asks for anything"
 
 
 @pytest.mark.parametrize("reverted", [0, 7])

@@ -1,7 +1,5 @@
 """Tests of regions: selection by masks, position, property and files of flags; content weights by region."""
 
-from __future__ import annotations
-
 import io
 import struct
 from dataclasses import replace
@@ -173,16 +171,6 @@ def test_content_weight_of_1_everywhere_is_bit_identical_to_none(tiny_weights: B
     assert torch.equal(actual.image_gradient, wanted.image_gradient)
 
 
-def test_only_the_content_term_depends_on_content_weights(tiny_weights: BackboneWeights) -> None:
-    coverage = images()[3]
-    network = FeatureNetwork(tiny_weights, dtype=torch.float64)
-    half, whole = (evaluate(network, coverage, own, None) for own in (coverage / 2, coverage))
-    for scale, terms in whole.terms.items():
-        for name, value in vars(terms).items():
-            expected = value / 2 if name == "content" else value
-            assert half.terms[scale][name] == pytest.approx(expected, rel=1e-12)
-
-
 # --- maps ----------------------------------------------------------------------------------------------------------
 
 
@@ -266,16 +254,6 @@ def make(weights: BackboneWeights, regions: Regions | None, **values: Any) -> St
 
 
 @pytest.mark.slow
-def test_content_weight_of_the_job_in_a_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
-    actual, wanted = make(tiny_weights, protected(1.0)), make(tiny_weights, None)
-    for stylizer in (actual, wanted):
-        run(stylizer)
-    seen = wanted.job.plan.seen  # unseen Gaussians follow their neighbors in the same region
-    assert torch.equal(actual.stylized()[seen], wanted.stylized()[seen])
-    assert [record.loss for record in actual.history] == [record.loss for record in wanted.history]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("treatment", [{"style": Style.of(style().flip(0, 2) ** 2)}])
 def test_only_the_protected_region_stays_near_its_content(
     tiny_weights: BackboneWeights, treatment: dict[str, Any]
@@ -349,15 +327,6 @@ def test_pointers_of_git_lfs_are_named(tmp_path: Path, file: SceneFile, name: st
     (tmp_path / name).write_text(LFS_POINTER)
     with pytest.raises(MaskError, match=rf"{name}: is a pointer of Git LFS, not the file itself\. Run `git lfs pull`"):
         read_mask(tmp_path / name, file)
-
-
-@pytest.mark.parametrize("rows", [1, 7, 8, 9, 20])
-def test_bits_and_arrays_select_the_same(tmp_path: Path, rows: int) -> None:
-    file = read_scene(write_files(tmp_path, wall(rows, 1))[0])
-    wanted = np.random.default_rng(rows).random(rows) < 0.5
-    (tmp_path / "m.npy").write_bytes(npy(wanted))
-    (tmp_path / "m.bin").write_bytes(np.packbits(wanted, bitorder="little").tobytes())
-    assert read_mask(tmp_path / "m.npy", file).tolist() == read_mask(tmp_path / "m.bin", file).tolist()
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Tests of scales: their weights in the loss, the scales that are drawn, and windows of rounds of views."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -13,10 +11,10 @@ from benchmarks.stability.sos_reference import sos_reference
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.planning.facts import check_scales
 from sgsst_core.quality.measure import Float32Reference, Measurements
-from sgsst_core.scales import EVEN, ScaleWeights, has_converged, has_reached, smoothed
+from sgsst_core.scales import ScaleWeights, has_converged, has_reached
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
@@ -29,30 +27,6 @@ from tests.small_scenes import cameras, style, wall
 SIZE, COARSEST = (160, 233), 50
 
 
-def evaluate(
-    weights: BackboneWeights,
-    values: tuple[float, ...],
-    tile_size: int | None = None,
-    dtype: torch.dtype = torch.float64,
-) -> tuple[SosResult, list[tuple[int, int]]]:
-    """Return the loss of a view at three scales, and the sizes of all images that the network processed."""
-    image, content, painting = (synthetic_image(*SIZE, seed=seed).to(dtype) for seed in (1, 2, 3))
-    coverage = (synthetic_image(*SIZE, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1).to(dtype)
-    network = FeatureNetwork(weights, dtype=dtype)
-    seen, forward = [], network.forward
-
-    def record_size(rgb: torch.Tensor, **options: Any) -> object:
-        seen.append((int(rgb.shape[0]), int(rgb.shape[1])))
-        return forward(rgb, **options)
-
-    network.forward = record_size  # type: ignore[method-assign, assignment]
-    loss = SosLoss(network, tile_size=tile_size, coarsest=COARSEST, scales=ScaleWeights(values))
-    targets = loss.targets.of_style(Style.of(painting), SIZE)
-    result = loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
-    assert targets.keys() == set(result.scales)
-    return result, seen
-
-
 @pytest.mark.parametrize(
     ("values", "tile_size"),
     [((1.0, 0.5, 2.0), 64), ((0.0, 3.0, 0.25), None), ((1.0,), 64), ((0.0, 0.0, 1e-9), None), ((1e12, 1e-12), 64)],
@@ -61,12 +35,16 @@ def test_float64_agrees_with_the_definition(
     tiny_weights: BackboneWeights, values: tuple[float, ...], tile_size: int | None
 ) -> None:
     image, content, painting = (synthetic_image(*SIZE, seed=seed) for seed in (1, 2, 3))
-    painting = resize_area(painting, style_size(SIZE, SIZE))
     coverage = (synthetic_image(*SIZE, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+    scaled = resize_area(painting, style_size(SIZE, SIZE))
     expected, gradient = sos_reference(
-        tiny_weights, image, painting, content, coverage=coverage, coarsest=COARSEST, scales=values
+        tiny_weights, image, scaled, content, coverage=coverage, coarsest=COARSEST, scales=values
     )
-    actual, _ = evaluate(tiny_weights, values, tile_size)
+    network = FeatureNetwork(tiny_weights, dtype=torch.float64)
+    loss = SosLoss(network, tile_size=tile_size, coarsest=COARSEST, scales=ScaleWeights(values))
+    targets = loss.targets.of_style(Style.of(painting), SIZE)
+    actual = loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
+    assert targets.keys() == set(actual.scales)
     assert actual.loss == pytest.approx(expected, rel=1e-9)
     assert actual.image_gradient is not None
     assert relative_error(actual.image_gradient, gradient) < 1e-9
@@ -95,23 +73,6 @@ def test_mean_gradient_of_all_draws_is_that_of_the_whole_loss(
     assert relative_error(mean, expected) < 1e-9
 
 
-def test_scales_without_weight_are_not_computed(tiny_weights: BackboneWeights) -> None:
-    result, seen = evaluate(tiny_weights, (0.0, 1.0))
-    assert result.scales == (1,)
-    assert all(height <= SIZE[0] // 2 and width <= SIZE[1] // 2 for height, width in seen)
-    assert len(seen) == 3  # content, style and view, once each
-
-
-def test_fractions_sum_to_one_and_need_a_weighted_scale() -> None:
-    weights = ScaleWeights((1.0, 0.0, 3.0))
-    assert weights.chosen(5) == [0, 2]
-    assert EVEN.chosen(3) == [0, 1, 2]
-    assert weights.fractions([0, 2]) == {0: 0.25, 2: 0.75}
-    assert weights.mean({0: 4.0, 2: 8.0}) == 7
-    with pytest.raises(ValueError, match="none of the scales"):
-        weights.fractions([1])
-
-
 @pytest.mark.parametrize("values", [(0.0, 0.0), (-1.0, 1.0), (math.nan,), (math.inf, 1.0), (1e13,), (1.0,) * 17])
 def test_invalid_weights_are_refused(values: tuple[float, ...]) -> None:
     with pytest.raises(SettingsError, match="scales"):
@@ -129,12 +90,6 @@ def test_scales_beyond_those_of_the_views_are_refused() -> None:
         check_scales((0.0, 1.0), views, 96)
     with pytest.raises(SettingsError, match="gives no weight to the 1 of 3 scales that view 'view_0' has"):
         check_scales((0.0, 1.0), [*cameras(1, 30, 20), *cameras(2, 128, 96)[1:]], 24)
-
-
-def test_smoothed_loss_is_the_geometric_mean_of_the_last_steps() -> None:
-    assert smoothed([100.0, 1.0, 4.0], 2) == pytest.approx(2.0)
-    assert smoothed([8.0, 2.0], 10) == pytest.approx(4.0)
-    assert smoothed([0.0, 0.0], 2) < 1e-200
 
 
 def test_convergence_ignores_differences_between_views() -> None:
@@ -187,11 +142,6 @@ def test_evaluated_loss_covers_the_weighted_scales(tiny_weights: BackboneWeights
     stylizer.job = replace(stylizer.job, plan=replace(stylizer.job.plan, novel_views=1))
     Measurements(stylizer).at_the_end()
     assert set(map(int, stylizer.measured[-1]["novel_views"]["gram"])) == {0, 2}
-
-
-def test_missing_scales_are_refused_before_the_survey(tiny_weights: BackboneWeights) -> None:
-    with pytest.raises(SettingsError, match="the views have 3 scales"):
-        make(tiny_weights, scales=(1.0, 0.0, 0.0, 1.0))
 
 
 def test_drawn_scales_are_the_same_after_a_resume_and_losses_cover_all(tiny_weights: BackboneWeights) -> None:

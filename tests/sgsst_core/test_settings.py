@@ -1,9 +1,7 @@
-from __future__ import annotations
-
 import pytest
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.settings import PresetName, Settings, make_settings
+from sgsst_core.settings import Settings, make_settings
 
 
 def test_paper_is_the_published_schedule() -> None:
@@ -30,20 +28,6 @@ def test_values_override_the_preset_unless_none() -> None:
 def test_explicit_learning_rate_is_constant_without_an_end() -> None:
     assert make_settings("standard", learning_rate=0.2).learning_rate_end == 0.2
     assert make_settings("standard", learning_rate=0.2, learning_rate_end=0.1).learning_rate_end == 0.1
-
-
-@pytest.mark.parametrize("preset", ["preview", "standard", "paper"])
-@pytest.mark.parametrize("part", [0, 0.3, 1, 2])
-def test_fewer_steps_follow_the_learning_rate_of_the_preset(preset: PresetName, part: float) -> None:
-    whole = make_settings(preset)
-    coarse, sos = int(whole.steps_coarse * part), int(whole.steps_sos * part)
-    settings = make_settings(preset, steps_coarse=coarse, steps_sos=sos)
-    if part >= 1:
-        assert settings.learning_rate_end == whole.learning_rate_end
-    every = whole.steps_coarse + whole.steps_sos
-    fraction = max(min(coarse + sos, every) - 1, 0) / (every - 1)  # of the steps between the first and the last
-    assert settings.learning_rate_at(1) == pytest.approx(whole.learning_rate_at(fraction))
-    assert make_settings(preset, steps_sos=sos, learning_rate_end=0.01).learning_rate_end == 0.01
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from sgsst_core.features.statistics import merge
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.files.images import load_image
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.terms import MAX_VECTORS, LayerTarget, layers_of, positions_per_image
+from sgsst_core.loss.terms import MAX_VECTORS, LayerTarget, positions_per_image
 from sgsst_core.regions import Region, Regions
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style, image_of, mixed_moments, normalized
@@ -60,15 +60,6 @@ def test_tiny_image_is_ignored_in_layers_without_cells(tiny_weights):
     alone = loss.targets.of_style(Style.of(large), (64, 64))[0][0].layers
     assert_same(mixed["relu4_1"], alone["relu4_1"], rtol=0, atol=0)
     assert not torch.equal(mixed["relu1_1"].mean, alone["relu1_1"].mean)
-
-
-def test_features_are_matched_with_those_of_all_images(tiny_weights):
-    network = FeatureNetwork(tiny_weights, layers_of("nnfm", tiny_weights, content=False))
-    loss = SosLoss(network, style_loss="nnfm", content_weight=0)
-    images = [synthetic_image(40, 48, seed=1), synthetic_image(64, 32, seed=2)]
-    mixed = loss.targets.of_style(Style.weighted(images, [1, 5]), (64, 64))[0][0].vectors.units
-    single = [loss.targets.of_style(Style.of(each), (64, 64))[0][0].vectors.units for each in images]
-    assert torch.equal(mixed, torch.cat(single))
 
 
 def test_number_of_vectors_is_limited_in_proportion_to_weights():

@@ -1,7 +1,5 @@
 """Scenes as trainers keep them: gsplat's dictionaries, and checkpoints of gsplat and nerfstudio."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

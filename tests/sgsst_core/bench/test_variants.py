@@ -1,17 +1,12 @@
 """Tests of the benchmarks that compare variants with equal time budgets, by one loss and by the judge."""
 
-from __future__ import annotations
-
 import io
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from PIL import Image
 from rich.console import Console
-from torch import Tensor
 
 from api.cli.scene_tools import error_time_table, point_line, quality_table
 from sgsst_core.bench.variants import (
@@ -21,22 +16,18 @@ from sgsst_core.bench.variants import (
     Curve,
     Point,
     Quality,
-    VariantResult,
     as_dict,
     choose_variants,
     compare_quality,
     error_time,
     pareto_front,
     write_plot,
-    write_quality_plot,
-    write_sheet,
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.judge import Lpips, VggLpips
-from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
+from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.steps import Evaluation
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, style, wall
 
@@ -72,30 +63,6 @@ def test_variants_are_evaluated_at_equal_times(
     assert values["pareto_front"]
 
 
-@pytest.mark.slow
-def test_all_variants_are_evaluated_with_the_papers_loss(
-    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Variants are evaluated with the paper's loss, even if all of them optimize another one."""
-    evaluations: list[Evaluation] = []
-    evaluate = Float32Reference.evaluate
-
-    def record_evaluation(self: Float32Reference, indices: list[int], sh_dc: Tensor) -> Evaluation:
-        evaluations.append(evaluate(self, indices, sh_dc))
-        return evaluations[-1]
-
-    monkeypatch.setattr(Float32Reference, "evaluate", record_evaluation)
-    scene, views, variants = wall(), cameras(2, 48, 36), choose_variants(["nnfm", "mixed"])
-    expected = 0
-    for style_loss in ("sos", "nnfm"):
-        curves = error_time(scene, views, style(), variants, 1.0, weights=tiny_weights, style_loss=style_loss)
-        assert all(len(curve.points) == 6 for curve in curves)
-        # The start is evaluated once, and moments that fall into one step share an evaluation.
-        expected += 1 + sum(len({point.step for point in curve.points}) for curve in curves)
-    assert len(evaluations) == expected
-    assert all(terms["nearest"] == 0 < terms["gram"] for evaluation in evaluations for terms in evaluation.values())
-
-
 def test_pareto_front_contains_undominated_points() -> None:
     def curve(name: str, *points: tuple[float, float]) -> Curve:
         return Curve(VARIANTS[name], [Point(seconds, 1, loss, {0: loss}) for seconds, loss in points])
@@ -111,14 +78,6 @@ def test_initial_loss_of_zero_has_no_ratio(tmp_path: Path) -> None:
     assert point_line(curves[0]) == "standard: the initial loss was 0, after 2.0 s, 1 steps"
     assert error_time_table(curves).row_count == 1
     write_plot(tmp_path / "plot.png", curves, "black")
-
-
-def test_presets_are_variants_with_their_own_settings() -> None:
-    """At the same time, only what differs from the standard preset is replaced, so that given settings stay."""
-    assert VARIANTS["preview"].settings["max_resolution"] == 640
-    assert VARIANTS["paper"].settings["learning_rate"] == 2.5e-3
-    assert "learning_rate" not in VARIANTS["preview"].settings
-    assert "seed" not in VARIANTS["paper"].settings
 
 
 def test_unknown_variant_error_names_it() -> None:
@@ -165,31 +124,6 @@ def test_consistency_is_measured_with_vgg(quality: Quality, tiny_weights: Backbo
     for outcome in (before, *variants):
         short = {network: views.measure(outcome.sh_dc).short for network, views in moments.items()}
         assert outcome.short == short["vgg"] != short["alex"]
-
-
-def test_pareto_front_contains_undominated_outcomes(quality: Quality) -> None:
-    def outcome(name: str, style: float, content: float) -> VariantResult:
-        judgment = replace(quality.outcomes[0].judgment, style=style, content=content)
-        return replace(quality.outcomes[0], name=name, judgment=judgment)
-
-    outcomes = [
-        outcome(UNSTYLIZED, 2.0, 0.0),  # does not count as a result
-        outcome("a", 1.0, 0.5),
-        outcome("b", 0.8, 0.6),
-        outcome("beaten", 1.1, 0.55),
-        outcome("c", 1.5, 0.1),
-    ]
-    assert [one.name for one in replace(quality, outcomes=outcomes).front()] == ["b", "a", "c"]
-
-
-def test_plot_and_sheet_are_written(quality: Quality, tmp_path: Path) -> None:
-    write_quality_plot(tmp_path / "q.png", quality, "a wall")
-    write_sheet(tmp_path / "q.jpg", quality)
-    assert Image.open(tmp_path / "q.png").width > 600
-    sheet = Image.open(tmp_path / "q.jpg")
-    assert sheet.height > 4 * 300  # style and four rows
-    on_white = quality.judge.renders(torch.zeros_like(wall().sh_dc), quality.judge.cameras[0])[1]
-    assert on_white.shape == (72, 96, 3)
 
 
 def test_too_few_cameras_are_refused(tiny_weights: BackboneWeights, vgg16_weights: object) -> None:

@@ -1,7 +1,5 @@
 """Tests of the network's layers with kernels: Winograd's convolution, pooling, first convolution."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -9,7 +7,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.bench.device_checks import texture
 from sgsst_core.features import layers as winograd
 from sgsst_core.features.layers import (
     convolve_pixels,
@@ -19,12 +16,9 @@ from sgsst_core.features.layers import (
     max_pool_backward,
     max_pool_backward_reference,
     pixel_gradient,
-    relu_backward,
 )
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.sos import SosLoss
-from sgsst_core.style import Style
+from sgsst_core.features.vgg import FeatureNetwork
 from tests.sgsst_core.synthetic_images import relative_error
 
 #: A whole window, sides that are no multiples of it, more than one part of windows, and fewer windows than threads.
@@ -122,22 +116,6 @@ def test_features_and_gradients_are_as_accurate_as_direct_ones(
     assert 0 < fewer < max(4 * direct, 1e-4)
 
 
-@pytest.mark.slow
-def test_tiles_add_up_to_the_gradient_of_the_whole_image(vgg16_weights: BackboneWeights) -> None:
-    """Windows of deep layers begin elsewhere in a tile than in the image."""
-    network, image = FeatureNetwork(vgg16_weights, STYLE_LAYERS, winograd=True), texture(208, 176, seed=1)
-    size, gradients = (208, 176), []
-    for fraction in (4.0, 0.6):
-        memory = int(fraction * 208 * 176 * network.held_bytes_per_pixel())
-        loss = SosLoss(network, content_weight=0, memory=memory)
-        style = loss.targets.of_style(Style.of(texture(208, 176, seed=2)), size)
-        gradients.append(loss.evaluate(image, style, loss.targets.of_view(image)).image_gradient)
-    whole, tiled = gradients
-    assert whole is not None
-    assert tiled is not None
-    assert 0 < float((tiled - whole).norm() / whole.norm()) < 1e-4
-
-
 def test_winograd_requires_float32(tiny_weights: BackboneWeights) -> None:
     with pytest.raises(ValueError, match="Winograd's algorithm are ways to multiply float32"):
         FeatureNetwork(tiny_weights, dtype=torch.bfloat16, winograd=True)
@@ -179,15 +157,6 @@ def test_max_pool_and_backward_pass_match_pytorch(size: tuple[int, int], dtype: 
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_negative_zeros_and_infinities_are_compared_as_numbers(dtype: torch.dtype) -> None:
-    window = torch.tensor([[-0.0, 0.0], [torch.inf, 1.0]], dtype=dtype)
-    source = torch.stack([window, -torch.zeros_like(window)])[None].contiguous(memory_format=torch.channels_last)
-    assert torch.equal(max_pool(source), torch.tensor([torch.inf, 0.0], dtype=dtype).view(1, 2, 1, 1))
-    result = max_pool_backward(torch.ones((1, 2, 1, 1), dtype=dtype), source)
-    assert result.flatten().tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_nan_is_the_maximum(dtype: torch.dtype, sign: float) -> None:
     """NaN of either sign must propagate through max pooling."""
@@ -196,22 +165,6 @@ def test_nan_is_the_maximum(dtype: torch.dtype, sign: float) -> None:
     assert bool(torch.signbit(source[0, 5, 1, 0])) == (sign < 0)
     assert max_pool(source)[0, 5].isnan().all()
     assert int(max_pool(source).isnan().sum()) == 1
-
-
-def test_non_contiguous_gradient_is_supported() -> None:
-    source = relu_output(8, 8, torch.float32)
-    gradient = torch.randn((1, 4, 6, 24), generator=torch.Generator().manual_seed(5)).permute(0, 3, 1, 2)[..., 1:5]
-    assert torch.equal(max_pool_backward(gradient, source), max_pool_backward_reference(gradient, source))
-
-
-def test_relu_backward_works_in_place() -> None:
-    output = relu_output(5, 7, torch.float32)
-    gradient = torch.randn(output.shape, generator=torch.Generator().manual_seed(6))
-    gradient = gradient.contiguous(memory_format=torch.channels_last)
-    expected = torch.where(output > 0, gradient, 0.0)
-    actual = relu_backward(gradient, output)
-    assert torch.equal(actual, expected)
-    assert actual.data_ptr() == gradient.data_ptr()
 
 
 pytest.importorskip("triton")

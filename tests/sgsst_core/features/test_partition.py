@@ -8,10 +8,8 @@ from sgsst_core.features.partition import (
     computed_twice,
     covered_region,
     partition,
-    scaled_region,
 )
 from sgsst_core.features.vgg import STYLE_LAYERS, layer_stride
-from sgsst_core.scene.colors import downscale
 
 
 @pytest.mark.parametrize("size", [(500, 730), (333, 517), (256, 1031), (64, 64), (15, 17), (1, 1)])
@@ -30,12 +28,6 @@ def test_every_cell_of_every_layer_has_one_owner(size, tile_size):
             assert own.bottom <= (tile.outer.bottom - tile.outer.top) // stride
             assert own.right <= (tile.outer.right - tile.outer.left) // stride
         assert (owners == 1).all()
-
-
-def test_halo_is_clipped_to_the_view():
-    for tile in partition(500, 730, 128, 64):
-        assert tile.outer.top == max(tile.inner.top - 64, 0)
-        assert tile.outer.right == min(tile.inner.right + 64, 730)
 
 
 @pytest.mark.parametrize(("tile_size", "halo"), [(0, 64), (100, 64), (128, 70)])
@@ -75,24 +67,6 @@ def test_covered_region_is_minimal_and_aligned():
     assert sum(tile.inner.pixels for tile in tiles) == region.pixels
 
 
-@pytest.mark.parametrize("scale", [0, 1, 2, 3])
-@pytest.mark.parametrize("size", [(100, 210), (97, 133), (64, 48)])
-def test_scaled_region_matches_downscaled_coverage(size, scale):
-    generator = torch.Generator().manual_seed(scale)
-    for _ in range(30):
-        rows, columns = (torch.randint(0, side + 1, (2,), generator=generator).sort().values.tolist() for side in size)
-        coverage = torch.zeros(size)
-        coverage[rows[0] : rows[1], columns[0] : columns[1]] = 1
-        region = covered_region(coverage)
-        coverage[region.slices] = 1
-        scaled = downscale(coverage, scale)
-        assert scaled_region(region, scale, tuple(scaled.shape)) == covered_region(scaled)
-
-
-def test_tile_size_ignores_pixels_outside_the_region():
-    assert choose_tile_size(4000, 4000, 64, held=1e6, working=0.5, region=Rectangle(1600, 1600, 2000, 2000)) is None
-
-
 @pytest.mark.parametrize("held", [0.0, 90.0, 130.0, 250.0, 299.0, 1000.0])
 @pytest.mark.parametrize("working", [0.0, 0.4])
 def test_cached_tiles_fit_and_leave_no_space_for_another(held, working):
@@ -103,9 +77,3 @@ def test_cached_tiles_fit_and_leave_no_space_for_another(held, working):
     assert total == 0 or total + working * max(areas) <= held
     assert all(total + area + working * max(areas) > held for area in others)
     assert computed_twice(areas, cached) == sum(areas) - total
-
-
-def test_view_that_just_fits_is_cached_whole():
-    assert cached_tiles([100], 140.0, 0.4) == [True]
-    assert cached_tiles([100], 139.0, 0.4) == [False]
-    assert choose_tile_size(1000, 1000, 64, held=1.4e6, working=0.4) is None

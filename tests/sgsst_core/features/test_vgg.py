@@ -1,7 +1,5 @@
 """Tests of the feature network's passes: memory format, cached activations, and PyTorch's flags on a GPU."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +9,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from sgsst_core.features import vgg
 from sgsst_core.features.network_weights import BackboneWeights
@@ -44,36 +41,19 @@ def test_pass_that_ends_early_returns_the_same_features(tiny_weights: BackboneWe
 
 
 class Watched(FeatureNetwork):
-    """Network that records PyTorch's flags and the memory formats during its convolutions."""
-
-    def note(self, *tensors: Tensor) -> None:
-        self.flags.add((CUDNN.conv.fp32_precision, CUDNN.benchmark, CUDNN.deterministic))
-        self.layouts += [tensor.is_contiguous(memory_format=torch.channels_last) for tensor in tensors]
+    """Network that records PyTorch's flags during its convolutions."""
 
     def __init__(self, *arguments: object, **options: object) -> None:
         self.flags: set[tuple[str, bool, bool]] = set()
-        self.layouts: list[bool] = []
         super().__init__(*arguments, **options)  # type: ignore[arg-type]
 
     def _convolve(self, x: Tensor, step: vgg._Convolution) -> Tensor:
-        result = super()._convolve(x, step)
-        self.note(x, step.weight, result)
-        return result
+        self.flags.add((CUDNN.conv.fp32_precision, CUDNN.benchmark, CUDNN.deterministic))
+        return super()._convolve(x, step)
 
     def _convolve_back(self, gradient: Tensor, step: vgg._Convolution) -> Tensor:
-        result = super()._convolve_back(gradient, step)
-        self.note(gradient, step.backward_weight, result)
-        return result
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_convolutions_run_in_channels_last(tiny_weights: BackboneWeights, dtype: torch.dtype) -> None:
-    """No convolution needs to copy its input, not even after a ReLU's or a pool's backward pass."""
-    network = Watched(tiny_weights, dtype=dtype)
-    pixel_gradient(network)
-    count = sum(isinstance(step, vgg._Convolution) for step in network._steps)
-    assert len(network.layouts) == 6 * count
-    assert all(network.layouts)
+        self.flags.add((CUDNN.conv.fp32_precision, CUDNN.benchmark, CUDNN.deterministic))
+        return super()._convolve_back(gradient, step)
 
 
 # --- flags of cuDNN on a GPU ---------------------------------------------------------------------------------------
@@ -224,61 +204,6 @@ def test_convolutions_with_different_results_are_not_fused(
 ) -> None:
     with operator_on_cpu(does):
         assert fuse(FeatureNetwork(tiny_weights)) == {False}
-
-
-def test_convolutions_without_an_engine_are_not_fused(tiny_weights: BackboneWeights) -> None:
-    assert fuse(FeatureNetwork(tiny_weights)) == {False}
-
-
-class AddsItsOutput:
-    """Stand-in for an algorithm that multiplies its uninitialized output by 0 for images of at least `least` pixels."""
-
-    def __init__(self, least: int) -> None:
-        self._least = least
-        self._poisoned: torch.Size | None = None
-
-    def poison(self, like: Tensor) -> None:
-        self._poisoned = like.shape
-
-    def __call__(self, x: Tensor, weight: Tensor, bias: Tensor, *rest: Any) -> Tensor:
-        result = fused(x, weight, bias, *rest)
-        memory = torch.full_like(result, torch.nan if result.shape == self._poisoned else 1.0)
-        self._poisoned = None
-        return result + 0 * memory if x.shape[2] * x.shape[3] >= self._least else result
-
-
-@pytest.mark.parametrize(("least", "fusable"), [(0, {False}), (SIZE[0] * SIZE[1], {True})])
-def test_algorithms_that_read_their_output_are_not_fused(
-    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, least: int, fusable: set[bool]
-) -> None:
-    """An algorithm that cuDNN chooses for large images only is found at the first of them, layer by layer."""
-    network = FeatureNetwork(tiny_weights)
-    expected = pixel_gradient(network)
-    assert SIZE[0] * SIZE[1] > vgg._TRIAL_SIDE**2
-    algorithm = AddsItsOutput(least)
-    monkeypatch.setattr(vgg, "_leave_nan", algorithm.poison)
-    with operator_on_cpu(algorithm):
-        assert fuse(network) == fusable
-        assert torch.equal(pixel_gradient(network), expected)
-    first_block = [step.fused for step in network._steps[:2] if isinstance(step, vgg._Convolution)]
-    assert first_block == [False, False]
-    if least:
-        assert all(step.fused for step in network._steps[2:] if isinstance(step, vgg._Convolution))
-
-
-def test_reused_memory_contains_nan() -> None:
-    """Check the trial's premise on an allocator that returns the last freed block of a size, as CUDA's does."""
-    alive: list[Tensor] = []
-
-    class Keep(TorchDispatchMode):
-        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-            alive.append(func(*args, **(kwargs or {})))
-            return alive[-1]
-
-    with Keep():
-        vgg._leave_nan(torch.zeros((1, 2, 3, 4)))
-    assert alive[-1].shape == (1, 2, 3, 4)
-    assert bool(alive[-1].isnan().all())
 
 
 def test_tensors_beyond_32_bits_are_not_fused(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,8 +3,6 @@
 Their counterparts without a GPU are in test_vgg, test_precision and test_timing.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F

@@ -1,21 +1,16 @@
 """Tests of atomic files and of JSON files."""
 
-from __future__ import annotations
-
 import errno
 import json
-import math
 import os
 import stat
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files import atomic
 from sgsst_core.files.atomic import HeldOpenError, atomic_path, ensure_writable_folder, remove_leftovers, write_json
-from sgsst_core.files.formats.scene_format import json_numbers
 
 
 def test_target_appears_only_when_complete(tmp_path: Path) -> None:
@@ -96,21 +91,6 @@ def test_ensure_writable_folder_creates_and_leaves_no_trace(tmp_path: Path) -> N
     assert os.listdir(folder) == []
 
 
-def test_ensure_writable_folder_refuses_files(tmp_path: Path) -> None:
-    file = tmp_path / "file"
-    file.touch()
-    with pytest.raises(OutputError, match="there is a file of that name"):
-        ensure_writable_folder(file)
-    with pytest.raises(OutputError, match="Not a directory"):
-        ensure_writable_folder(file / "below")
-
-
-@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc: a folder that not even root can write to")
-def test_ensure_writable_folder_tries_to_write() -> None:
-    with pytest.raises(OutputError, match=r"/proc/self: is not writable\. Name another"):
-        ensure_writable_folder(Path("/proc/self"))
-
-
 def test_only_leftovers_of_the_target_are_removed(tmp_path: Path) -> None:
     target, other = tmp_path / "a.ply", tmp_path / "b.ply"
     paths = []
@@ -119,13 +99,6 @@ def test_only_leftovers_of_the_target_are_removed(tmp_path: Path) -> None:
         paths.append(writer.__enter__())
     remove_leftovers(target)
     assert [path.exists() for path in paths] == [False, True]
-
-
-def test_existing_entries_do_not_make_a_folder_unwritable(tmp_path: Path) -> None:
-    for name in ("trial", "sgsst", "part"):
-        (tmp_path / name).mkdir()
-    ensure_writable_folder(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["part", "sgsst", "trial"]
 
 
 def test_file_that_cannot_replace_its_target_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,23 +124,3 @@ def test_file_that_cannot_replace_its_target_is_kept(tmp_path: Path, monkeypatch
 def test_non_unicode_names_are_written_as_json(tmp_path: Path) -> None:
     write_json(tmp_path / "r.json", {"path": "caf\udce9.ply"})
     assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8")) == {"path": "caf\udce9.ply"}
-
-
-def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
-    with pytest.raises(OutputError):
-        write_json(tmp_path / "missing" / "r.json", {})
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_numbers_are_accepted() -> None:
-    assert json_numbers([1, 2.5, 10**30], 3).tolist() == [1, 2.5, 1e30]
-    assert json_numbers(7, 1).tolist() == [7]
-    assert math.isnan(json_numbers([None], 1)[0])
-
-
-@pytest.mark.parametrize(
-    "values", [[], [1], [1, 2, 3], ["1_0", 2], [True, 2], [[1], [2]], [{}, 2], "12", {"a": 1, "b": 2}]
-)
-def test_other_values_are_refused(values: Any) -> None:
-    with pytest.raises(ValueError, match="in place of 2 numbers"):
-        json_numbers(values, 2)

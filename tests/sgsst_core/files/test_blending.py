@@ -1,7 +1,5 @@
 """Tests of blends against float64 references, and of the scenes that cannot be blended."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,9 +1,6 @@
 """Tests that photos are found by name, fit their cameras, and are read as the cameras see them."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,16 +11,11 @@ from sgsst_core.errors import ImageError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.photos import Photo, check_photos, find_masks, load_photo
 from sgsst_core.scene.camera import Camera, resized
+from tests.sgsst_core.files.test_images import save
 
 
 def camera(name: str, width: int = 90, height: int = 60) -> Camera:
     return Camera(name, width, height, 100.0, 100.0, width / 2, height / 2, torch.eye(4, dtype=torch.float64))
-
-
-def save(path: Path, image: Image.Image, **options: Any) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image.save(path, **options)
-    return path
 
 
 def paths(matches: list[Photo | None]) -> list[Path]:

@@ -1,7 +1,5 @@
 """Tests of checkpoints of gsplat and nerfstudio, hostile ones included, and of gsplat's dictionaries."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from dataclasses import replace

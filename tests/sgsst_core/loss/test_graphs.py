@@ -1,30 +1,32 @@
-"""Tests on a simulated GPU that the loss by captured CUDA graphs is bit-identical to the eager loss."""
+"""Tests on a simulated GPU that losses and steps with captured CUDA graphs are bit-identical to eager ones."""
 
-from __future__ import annotations
-
-import inspect
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-if torch.cuda.is_available():
-    pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
-
 from sgsst_core.devices import Timer
-from sgsst_core.features.layers import convolve_pixels, relu_backward
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, can_use_graphs
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.terms import StyleTargets, ViewTarget
 from sgsst_core.parallel.division import Tiling
+from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.survey import survey_views
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.job import JobInputs, prepare_job
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
-from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
+from tests.sgsst_core.synthetic_images import synthetic_image
+from tests.small_scenes import ball, cameras, style, wall
 
+if torch.cuda.is_available():
+    pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
 pytest.importorskip("triton")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -36,12 +38,6 @@ SCALES = [0, 1]
 def without_triton(counts: Counts, monkeypatch: pytest.MonkeyPatch) -> None:
     """Disable Triton's kernels, so that the slow interpreter is not needed."""
     leave_out_kernels(monkeypatch)
-
-
-def lines_of(function: Any) -> list[str]:
-    """Return the lines of a function of `layers` as in the counts of launches."""
-    lines, first = inspect.getsourcelines(function)
-    return [f"sgsst_core/features/layers.py:{first + number}" for number in range(len(lines))]
 
 
 def image(seed: int, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
@@ -97,43 +93,6 @@ def test_graph_is_bit_identical_to_eager_mode_for_every_view(
     assert loss.timer.read()["network"] > 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("tile_size", "dtype", "tolerance"),
-    [(None, torch.float32, 1e-5), (32, torch.float32, 1e-5), (None, torch.bfloat16, 0.03)],
-)
-def test_kernels_agree_with_tensor_functions_and_pass_relus(
-    counts: Counts,
-    tiny_weights: BackboneWeights,
-    monkeypatch: pytest.MonkeyPatch,
-    tile_size: int | None,
-    dtype: torch.dtype,
-    tolerance: float,
-) -> None:
-    """Kernels of the style gradient and the content term pass ReLUs, but not in tiles with cells that others own."""
-    loss = SosLoss(FeatureNetwork(tiny_weights, dtype=dtype, device="cuda"), coarsest=16, tile_size=tile_size)
-    style, view, pixels = style_of(loss), view_of(loss, 2, weighted=True), image(1)
-    results, relus, used = [], [], []
-    for leave_out in (False, True):
-        if leave_out:
-            leave_out_kernels(monkeypatch)
-        counts.clear()
-        results.append(loss.evaluate(pixels, style, view, SCALES))
-        first_layer, relu = (
-            sum(counts.launches[line] for line in lines_of(function)) for function in (convolve_pixels, relu_backward)
-        )
-        used.append(first_layer > 0)
-        relus.append(relu)
-    fast, plain = (result.image_gradient for result in results)
-    assert fast is not None
-    assert plain is not None
-    assert relative_error(fast.cpu(), plain.cpu().double()) < tolerance
-    assert relative_error(results[0].values.cpu(), results[1].values.cpu()) < tolerance
-    assert used == [dtype == torch.bfloat16, False]
-    if tile_size is None:  # of eleven convolutions, relu3_2 alone is neither pooled nor part of the loss
-        assert relus == [len(SCALES), 11 * len(SCALES)]
-
-
 @pytest.mark.usefixtures("without_triton")
 def test_graphs_copy_the_content_weights_of_each_view(tiny_weights: BackboneWeights) -> None:
     loss = make_loss(tiny_weights, content_weight=1e4)
@@ -181,21 +140,6 @@ def test_graphs_need_a_pytorch_that_survives_a_failed_capture(monkeypatch: pytes
         assert can_use_graphs("cuda") is usable
 
 
-@pytest.mark.usefixtures("without_triton")
-@pytest.mark.parametrize(("options", "fits"), [({"tile_size": 32}, 9.0), ({}, 1.9), ({}, 2.1)])
-def test_only_scales_of_one_tile_that_fit_twice_are_captured(
-    tiny_weights: BackboneWeights, options: dict[str, Any], fits: float
-) -> None:
-    network = FeatureNetwork(tiny_weights, device="cuda")
-    once = HEIGHT * WIDTH * (network.held_bytes_per_pixel() + network.working_bytes_per_pixel())
-    loss = make_loss(tiny_weights, content_weight=0.0, memory=int(fits * once), **options)
-    style, view = style_of(loss), loss.targets.of_view(image(2))
-    graphs = LossGraphs(loss)
-    for step in range(FIRST_VISITS):
-        assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
-    assert (graphs.captured, graphs.problem) == (int(fits == 2.1), None)
-
-
 def test_graphs_require_a_gpu_enough_memory_and_one_rank(tiny_weights: BackboneWeights) -> None:
     assert not can_use_graphs("cpu")
     tiling = Tiling(halo=64, held=1000.0, working=0.25, coarsest=16)
@@ -209,3 +153,64 @@ def test_graphs_require_a_gpu_enough_memory_and_one_rank(tiny_weights: BackboneW
     loss = SosLoss(network, collectives=Two())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="communication between ranks"):
         LossGraphs(loss)
+
+
+#: Maximum number of launches of a step outside its graph, with views, style and intersections cached.
+MOST_LAUNCHES = 60
+
+
+def make(weights: BackboneWeights, *, graphs: bool, scan: bool) -> Stylizer:
+    """Make a job with two views, two scales and three steps per phase; a scan gets random background colors."""
+    scene, views = ball(40) if scan else wall(10, 8), cameras(2, 48, 32)
+    settings = make_settings(coarsest_side=16, steps_coarse=3, steps_sos=3, scale_sampling=1)
+    survey = survey_views(scene, views, make_rasterizer("cpu", scene))
+    some = survey.total_blend_weights > 0
+    plan = Plan(
+        survey=survey,
+        optimized=some,
+        seen=some,
+        covered=tuple(survey.covered),
+        weighted=scan,
+        training_background="random" if scan else "background",
+        steps_coarse=settings.steps_coarse,
+        memory_limit=10**9,
+        device="cuda",
+        rasterizer="triton",
+        uncached="triton",
+        graphs=graphs,
+    )
+    return Stylizer(prepare_job(plan, JobInputs(scene, views, Style.of(style()), settings, weights=weights)))
+
+
+def test_kernels_run_on_the_device_of_their_data(counts: Counts, tiny_weights: BackboneWeights) -> None:
+    """The caller's current device may be another one, as in a new thread."""
+    stylizer = make(tiny_weights, graphs=False, scan=True)
+    torch.cuda.set_device(1)
+    stylizer.run_step()
+    assert torch.cuda.current_device() == 1
+    assert stylizer.step == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scan", [False, True])
+def test_steps_with_graphs_are_bit_identical(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, scan: bool
+) -> None:
+    """In both phases, the first of two views that share a graph prepares it, and the second is captured."""
+    if not scan:  # once is enough for the network's Triton kernels, which are slow in the interpreter
+        leave_out_kernels(monkeypatch)
+    plain, graphs = (make(tiny_weights, graphs=graphs, scan=scan) for graphs in (False, True))
+    for _ in range(plain.job.total_steps):
+        expected, stage = plain.run_step(), graphs.phase.stage
+        counts.clear()
+        actual = graphs.run_step()
+        assert (actual.view, actual.loss, actual.terms) == (expected.view, expected.loss, expected.terms)
+        if sum(record.stage == stage for record in graphs.history) > FIRST_VISITS:
+            assert counts.waits.total() == 1
+            assert {"network", "render", "raster_backward"} <= actual.parts.keys()
+            if not scan:  # a drawn background color changes the content features, which are computed outside
+                assert counts.launches.total() < MOST_LAUNCHES
+                assert "vgg_forward" not in actual.parts
+    assert graphs.stylized().equal(plain.stylized())
+    assert graphs.job.graphs is not None
+    assert (graphs.job.graphs.captured, graphs.job.graphs.problem) == (2, None)

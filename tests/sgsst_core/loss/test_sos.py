@@ -1,7 +1,5 @@
 """Tests of the SOS loss of a view, also with regions, against float64."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -9,7 +7,7 @@ import torch
 
 from benchmarks.stability.sos_reference import StyledWeights, sos_reference
 from sgsst_core.errors import SettingsError
-from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import combined, layers_of
 from sgsst_core.regions import Region, Regions, check_regions
@@ -92,20 +90,6 @@ def test_float32_does_not_depend_on_the_partition(tiny_weights, size, tile_sizes
         tiled = evaluate(network, case, tile_size)
         assert tiled.loss == pytest.approx(whole.loss, rel=1e-5)
         assert relative_error(tiled.image_gradient, whole.image_gradient) < FLOAT32_TOLERANCE
-
-
-def test_unneeded_content_and_layers_are_not_computed(tiny_weights):
-    """Without content weight, the content layer and layers beyond the deepest used one are not computed."""
-    image, style, content, _ = (None if t is None else t.float() for t in setting((200, 300)))
-    full = SosLoss(FeatureNetwork(tiny_weights, (*STYLE_LAYERS, CONTENT_LAYER)), content_weight=0)
-    lean = SosLoss(FeatureNetwork(tiny_weights, STYLE_LAYERS), content_weight=0)
-    results = [
-        loss.evaluate(image, loss.targets.of_style(Style.of(style), (200, 300)), loss.targets.of_view(content))
-        for loss in (full, lean)
-    ]
-    assert torch.equal(results[0].image_gradient, results[1].image_gradient)
-    shallow = FeatureNetwork(tiny_weights, ("relu1_1", "relu2_1"))
-    assert len(shallow.forward(image).outputs) == 4  # conv1_1, conv1_2, pool1, conv2_1
 
 
 @pytest.mark.parametrize("size", [(1, 1), (15, 17), (16, 16), (3, 200)])

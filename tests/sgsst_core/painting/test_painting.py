@@ -1,7 +1,5 @@
 """Tests of painted views: the solver against dense float64 least squares, and what spreads to the other Gaussians."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Tests of the survey, and of the checks whether scene, cameras and photos belong together."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable
@@ -21,8 +19,7 @@ from sgsst_core.files.images import save_png
 from sgsst_core.files.photos import Photo, check_photos
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit import OrbitRequest, make_orbit
-from sgsst_core.planning.survey import compare_photos, fitted_psnr, frame_warnings, implausible, shown_by, survey_views
-from sgsst_core.progress import Progress
+from sgsst_core.planning.survey import compare_photos, fitted_psnr, frame_warnings, implausible, shown_by
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
@@ -38,30 +35,10 @@ from tests.small_scenes import ball, blind_camera, cameras, style, wall
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_survey_reports_its_progress() -> None:
-    scene, reports = wall(), list[Progress]()
-    survey_views(scene, cameras(3), make_rasterizer("cpu", scene), show=reports.append)
-    assert [(progress.step, progress.total) for progress in reports] == [(0, 3), (1, 3), (2, 3), (3, 3)]
-    assert [progress.fraction for progress in reports] == [0, 1 / 3, 2 / 3, 1]
-
-
 def test_plan_requires_cameras_that_see_the_scene(tiny_weights: BackboneWeights) -> None:
     for views, message in (([], "There are no cameras"), ([blind_camera()], "None of the 1 cameras sees")):
         with pytest.raises(CameraError, match=message):
             plan_job(JobInputs(wall(), views, Style.of(style()), make_settings(), weights=tiny_weights))
-
-
-def test_earlier_survey_is_reused(tiny_weights: BackboneWeights) -> None:
-    scene, settings, reports = wall(), make_settings(), list[Progress]()
-    first = plan_job(JobInputs(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights)).plan
-    second = plan_job(
-        JobInputs(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights),
-        survey=first.survey,
-        show=reports.append,
-    ).plan
-    assert not reports
-    assert second.survey is first.survey
-    assert torch.equal(second.seen, first.seen)
 
 
 NEAR = 0.2
@@ -89,11 +66,6 @@ def verdict(scene: Scene, views: list[Camera]) -> str:
     except CameraError:
         return "refused"
     return "warned" if warnings else "fine"
-
-
-@pytest.mark.parametrize("scene", [wall(), ball()])
-def test_cameras_of_the_scene_give_no_warning(scene: Scene) -> None:
-    assert frame_warnings(scene, cameras(), NEAR) == []
 
 
 @pytest.mark.parametrize(
@@ -189,23 +161,6 @@ def rendered(folder: Path, scene: Scene, views: list[Camera]) -> list[Photo]:
     for view in views:
         save_png(folder / f"{view.name}.png", rasterizer.render(colors, view))
     return [photo for photo in check_photos(folder, views) if photo]
-
-
-def test_matching_photos_give_no_warning(tmp_path: Path) -> None:
-    scene, views = wall(), cameras()
-    photos = rendered(tmp_path, scene, views)
-    assert compare_photos(scene, views, photos, NEAR) == (photos, [])
-
-
-def test_cropped_photos_are_reported(tmp_path: Path) -> None:
-    scene, views = wall(), cameras()
-    photos = rendered(tmp_path, scene, views)
-    for photo in photos:
-        image = Image.open(photo.path)
-        width, height = image.size
-        image.crop((width // 4, height // 4, width, height)).resize(image.size).save(photo.path)
-    _, (line,) = compare_photos(scene, views, photos, NEAR)
-    assert line.decision.startswith("warning: they differ from the scene's renders (")
 
 
 @pytest.mark.parametrize("applied", [False, True])

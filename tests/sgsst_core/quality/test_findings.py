@@ -1,7 +1,5 @@
 """Tests of `sgsst check` on scenes, views and styles, each with one extreme property, and of the PSNR of scenes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +11,9 @@ from plyfile import PlyData, PlyElement
 
 from sgsst_core.constants import NEAR
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
-from sgsst_core.planning.survey import survey_views
 from sgsst_core.quality import findings
 from sgsst_core.quality.findings import (
     Finding,
-    findings_of,
     render_mode_findings,
     scene_findings,
     small_gaussians,
@@ -31,7 +27,6 @@ from sgsst_core.rasterizer.reference import splat
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering
-from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
@@ -51,21 +46,6 @@ def seen_by(folder: Path, scene: Scene, views: list[Camera]) -> dict[str, Findin
     file = stored(folder, scene)
     rasterizer = make_rasterizer("cpu", file.scene)
     return {finding.what: finding for finding in view_findings(file, views, rasterizer, near=NEAR)}
-
-
-@pytest.mark.parametrize("looks_away", [False, True])
-def test_existing_survey_gives_the_same_findings(tmp_path: Path, looks_away: bool) -> None:
-    """Findings have the same text as without an existing survey. One camera looks away and sees nothing."""
-    file, views = stored(tmp_path, wall()), cameras()
-    if looks_away:
-        away = views[0].world_to_camera.clone()
-        away[[0, 2]] *= -1  # rotation by 180 degrees about the camera's own vertical axis
-        views[0] = replace(views[0], world_to_camera=away)
-    survey = survey_views(file.scene, views, make_rasterizer("cpu", file.scene, near=NEAR))
-    reread = findings_of(file, views, style(), near=NEAR)
-    assert findings_of(file, views, style(), near=NEAR, survey=survey) == reread
-    assert any("see no Gaussian" in finding.what for finding in reread) == looks_away
-    assert any("in no view" in finding.what for finding in reread)
 
 
 def finding_about(findings: dict[str, Finding], text: str) -> Finding:
@@ -283,15 +263,3 @@ def test_counts_are_those_of_the_reference(tmp_path: Path) -> None:
 
 def visible_in(scene: Scene, view: Camera) -> list[int]:
     return project(scene, view).gaussians.tolist()
-
-
-def test_psnr_is_that_of_all_pixels() -> None:
-    scene, views = wall(), cameras()
-    assert scene_psnr(scene, scene, views, near=0.2) is None
-    other = replace(scene, sh_dc=scene.sh_dc + 0.1)
-    squares = []
-    for view in views:
-        one, two = (make_rasterizer("cpu", each).render(scene_colors(each, view), view) for each in (scene, other))
-        squares.append((one.clamp(0, 1).double() - two.clamp(0, 1).double()).square())
-    expected = -10 * torch.cat([each.flatten() for each in squares]).mean().log10()
-    assert scene_psnr(scene, other, views, near=0.2) == pytest.approx(float(expected))

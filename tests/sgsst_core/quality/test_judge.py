@@ -1,7 +1,5 @@
 """Tests of the judge and of LPIPS, against plain float64 formulas and on scenes with known outcomes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +25,6 @@ from sgsst_core.quality.judge import (
     Judgment,
     Lpips,
     VggLpips,
-    frechet_distance,
     load_lpips_or_none,
     load_vgg_lpips_or_none,
     saturated,
@@ -223,15 +220,6 @@ def test_objects_smaller_than_receptive_fields_have_no_interior_measures(alex: L
     judgment = judged(judge_of(alex, ball(), cameras(1)), ball().sh_dc)
     assert judgment.interior_style is None
     assert judgment.sliced_features is None
-
-
-def test_frechet_distance_of_known_distributions() -> None:
-    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    none = torch.zeros(3, 3, dtype=torch.float64)
-    shifted = torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64)
-    assert frechet_distance((zero, eye), (zero, eye)) == pytest.approx(0, abs=1e-4)
-    assert frechet_distance((zero, none), (shifted, none)) == pytest.approx(25.5)
-    assert frechet_distance((zero, 0.04 * eye), (zero, 0.01 * eye)) == pytest.approx(255 * 0.1 * 3**0.5)
 
 
 def test_out_of_range_colors_are_saturated() -> None:

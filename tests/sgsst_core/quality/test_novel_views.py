@@ -1,7 +1,5 @@
 """Tests of novel views: camera poses, Gram distances, and consistency on planes, whose warps are known exactly."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import random
@@ -35,9 +33,10 @@ from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scales import scale_count
 from sgsst_core.scene.camera import Camera, between, look_at
 from sgsst_core.scene.colors import resize_area, style_size
-from sgsst_core.scene.gaussians import TENSORS, Scene, sampled
+from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Style
+from tests.sgsst_core.objects import joined
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 AXIS = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
@@ -270,7 +269,7 @@ def test_view_inside_an_object_is_not_measured(network):
     centered = shell.means - torch.tensor([0.0, 0, 3])
     shell = replace(shell, means=centered * (0.4 / 0.7), scales=torch.full_like(shell.scales, math.log(0.04)))
     background = wall()
-    both = Scene(*(torch.cat([getattr(background, f), getattr(shell, f)]) for f in TENSORS))
+    both = joined(background, shell)
     empty, filled = novel_views(background, views, network), novel_views(both, views, network)
     assert names(empty.cameras) == names(filled.cameras) == ["0–1", "1–2", "2–3"]
     assert (empty.views, empty.pairs[SHORT_RANGE]) == ([0, 1], [(0, 1), (1, 2)])
@@ -336,10 +335,6 @@ def plane(half_width: float, half_height: float, depth: float, color: Tensor | N
     scales = torch.tensor([SPACING, SPACING, SPACING / 100]).log().expand(len(x), 3)
     quats = torch.tensor([1.0, 0, 0, 0]).expand(len(x), 4)
     return Scene(means, quats, scales, torch.full_like(x, 8.0), (rgb - COLOR_OFFSET) / SH_C0, torch.zeros(len(x), 0, 3))
-
-
-def joined(first: Scene, second: Scene) -> Scene:
-    return Scene(*(torch.cat([getattr(first, f), getattr(second, f)]) for f in TENSORS))
 
 
 def camera(position: tuple[float, float, float], target: tuple[float, float, float] = (0, 0, DEPTH)) -> Camera:
@@ -436,23 +431,6 @@ def test_pixels_of_a_plane_move_by_its_homography(first: Camera, tolerance: floa
     torch.testing.assert_close(z, (DEPTH - other.center[2]) / slope, rtol=tolerance / 20, atol=0)
 
 
-def test_warp_reproduces_the_image_of_the_other_camera():
-    scene = plane(5, 4, DEPTH)
-    cameras = [camera((0.4, -0.1, 0)), camera((1.0, -0.4, 0.4))]
-    rasterizer = make_rasterizer("cpu", scene)
-    images = renders(scene, cameras, rasterizer)
-    depths = [expected_depth(scene, c, rasterizer) for c in cameras]
-    warped, valid = find_warp(depths[1], cameras[1], depths[0], cameras[0]).apply(images(1))
-    positions = pixel_centers(cameras[0]) @ homography(*cameras).T
-    x, y = positions[..., 0] / positions[..., 2], positions[..., 1] / positions[..., 2]
-    to_border = torch.stack([x - 0.5, 63.5 - x, y - 0.5, 47.5 - y]).amin(0)
-    assert valid[to_border > 0.1].all()
-    assert not valid[to_border < -0.1].any()
-    assert 0.5 < float(valid.double().mean()) < 1
-    assert float((warped - images(0))[valid].abs().max()) < 0.03
-    assert not warped[~valid].any()
-
-
 def test_pixels_hidden_in_the_other_view_are_masked():
     red, blue = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9])
     scene = joined(plane(6, 4, DEPTH, blue), plane(0.4, 0.4, 2.0, red))
@@ -478,16 +456,6 @@ def test_pixels_hidden_in_the_other_view_are_masked():
     assert (careless - images(0))[hidden].abs().amax(-1).min() > 0.7  # the patch is painted onto the wall behind it
     assert measure(scene, cameras).rmse < 0.02
     assert float((warped - images(0))[valid].abs().max()) < 0.1
-
-
-def test_identical_cameras_give_zero(lpips):
-    # The scene's edge is in view; rounding must not exclude the pixels of its silhouette.
-    result = measure(plane(1, 1, DEPTH), [camera((0.3, 0.2, 0))] * 3, lpips=lpips)
-    assert len(result.pairs) == 2
-    assert result.rmse < 1e-6
-    assert result.lpips < 1e-9
-    scene = plane(5, 4, DEPTH)
-    assert measure(scene, [camera((0.3, 0.2, 0))] * 2).compared == 1.0
 
 
 def test_inconsistent_colors_give_larger_values(lpips):
@@ -553,12 +521,3 @@ def test_pairs_are_all_or_evenly_spread():
     assert view_pairs(2, 2) == view_pairs(0, 1) == []
     assert view_pairs(97, 7, at_most=3) == [(15, 22), (45, 52), (75, 82)]
     assert view_pairs(4, 1, at_most=9) == view_pairs(4, 1)
-
-
-def test_incomparable_images_are_refused_by_name():
-    scene = plane(1, 1, DEPTH)
-    rasterizer = make_rasterizer("cpu", scene)
-    with pytest.raises(ValueError, match=r"'view': shape \(48, 63, 3\), not \(48, 64, 3\)"):
-        consistency_of(lambda i: torch.zeros(48, 63, 3), arc(2), rasterizer, scene, 1)
-    with pytest.raises(ValueError, match="'view': holds NaN"):
-        consistency_of(lambda i: torch.full((48, 64, 3), math.nan), arc(2), rasterizer, scene, 1)

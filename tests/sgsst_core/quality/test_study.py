@@ -1,7 +1,5 @@
 """Tests of blind comparisons: what the page reveals, and how votes are counted."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Independent renderer, and comparison of renders outside the band where rounding decides."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor

@@ -1,30 +1,20 @@
 """Tests of the projection and of tile intersections."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from sgsst_core.constants import ALPHA_MIN, EPS2D
-from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.projection import (
     Column,
-    TileIntersections,
-    build_tile_intersections,
-    depth_order,
     project,
 )
 from sgsst_core.rasterizer.reference import splat
-from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.gaussians import Scene
-from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, has_intersections, rotated_pose, single, together
+from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, rotated_pose, single, together
 
 _HALF_LOG2_E = 0.5 * math.log2(math.e)
 
@@ -125,72 +115,3 @@ def test_scene_far_from_origin_projects_alike() -> None:
     there = project(replace(scene, means=scene.means + offset.float()), replace(view, world_to_camera=pose))
     assert here.gaussians.tolist() == there.gaussians.tolist()
     assert np.allclose(here.values, there.values, rtol=1e-6, atol=1e-6)
-
-
-_RANDOM = np.random.default_rng(0)
-DEPTHS: dict[str, NDArray[np.float64]] = {
-    "spread": np.exp(_RANDOM.normal(size=5000)),
-    "many equal": _RANDOM.integers(1, 40, 5000).astype(np.float64),
-    "all equal": np.full(3000, 3.0),
-    "nearly equal": 1 + 1e-13 * _RANDOM.random(3000),
-    "one far off": np.append(1 + 1e-6 * _RANDOM.random(3000), 1e300),
-    "all magnitudes": 10.0 ** _RANDOM.uniform(-300, 300, 3000),
-    "infinite": np.array([2.0, np.inf, 5e-324, np.inf, 1e300]),
-    "one": np.array([2.0]),
-}
-
-
-@pytest.fixture(params=[1, 2])
-def threads(request: pytest.FixtureRequest) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.mark.parametrize("name", DEPTHS)
-def test_depth_order_equals_a_stable_sort(name: str, threads: None) -> None:
-    depths = DEPTHS[name]
-    visible = np.flatnonzero(_RANDOM.random(len(depths)) < 0.8)
-    order = depth_order(depths, visible)
-    assert np.array_equal(order, visible[np.argsort(depths[visible], kind="stable")])
-
-
-def intersections_one_by_one(scene: Scene, view: Camera) -> list[list[int]]:
-    """Return the depth-order indices in each raster tile, from intersections of one Gaussian at a time."""
-    gaussians = project(scene, view).gaussians
-    tiles: list[list[int]] = [[] for _ in range(-(-view.width // 16) * -(-view.height // 16))]
-    for rank, gaussian in enumerate(gaussians):
-        alone = build_tile_intersections(scene.subset(torch.tensor([int(gaussian)])), view)
-        for tile in np.flatnonzero(np.diff(alone.starts)):
-            tiles[tile].append(rank)
-    return tiles
-
-
-def check_slots(isects: TileIntersections) -> None:
-    """Check that each pair has a slot, and that the slots of a Gaussian are adjacent and ordered by tile."""
-    order = np.argsort(isects.slots, kind="stable")
-    assert np.array_equal(isects.slots[order], np.arange(len(isects.slots)))
-    assert np.array_equal(
-        isects.ranks[order], np.repeat(np.arange(len(isects.first_slots) - 1), np.diff(isects.first_slots))
-    )
-
-
-@pytest.mark.parametrize("count", [0, 1, 3, 150])
-def test_tile_intersections_equal_a_loop_over_gaussians(count: int, threads: None) -> None:
-    scene, view = cloud(count, seed=32), camera(97, 61)
-    scene.scales[:10] += 4  # as large as the view
-    isects = build_tile_intersections(scene, view)
-    expected = intersections_one_by_one(scene, view)
-    assert np.array_equal(np.diff(isects.starts), [len(tile) for tile in expected])
-    assert isects.ranks.tolist() == [rank for tile in expected for rank in tile]
-    check_slots(isects)
-
-
-def test_tile_intersections_beyond_a_new_limit_are_evicted_last_first() -> None:
-    scene = cloud(300, seed=35)
-    views = [camera(pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2)]
-    cpu = CpuRasterizer(scene)
-    sizes = [cpu.intersections(view).nbytes for view in views]
-    cpu.release_view(views[0], sizes[1])
-    assert [has_intersections(cpu, view) for view in views] == [False, True, False]

@@ -1,13 +1,10 @@
 """Tests of all CPU rasterizers against the float64 reference, also for antialiased scenes."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess
 import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -28,7 +25,6 @@ from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.projection import (
     MAX_INTERSECTIONS,
     Column,
-    build_tile_intersections,
     check_intersections,
     project,
 )
@@ -45,7 +41,6 @@ from tests.sgsst_core.splat_scenes import (
     cloud,
     colors_of,
     empty_scene,
-    has_intersections,
     pixels_like,
     rotated_pose,
     single,
@@ -199,21 +194,6 @@ def test_crops_of_a_view_make_up_the_whole_view(name: str, row: int, column: int
     assert relative_error(gradient, rasterizer.color_gradient(pixels, view)) < 1e-6
 
 
-def test_crops_have_tile_intersections_of_their_own() -> None:
-    """A crop takes a fraction of the memory, and nothing remains once its view is forgotten."""
-    scene, view = cloud(2000, seed=13), camera(200, 120)
-    rasterizer = make_rasterizer("cpu", scene)
-    crop = view.cropped(0, 0, 64, 96)
-    whole, part = (build_tile_intersections(scene, each) for each in (view, crop))
-    assert part.nbytes < 0.5 * whole.nbytes
-    rasterizer.render(colors_of(scene), crop)
-    cpu = rasterizer.uncached
-    assert isinstance(cpu, CpuRasterizer)
-    assert cpu.intersections(crop).nbytes == part.nbytes
-    rasterizer.forget_views()
-    assert not has_intersections(cpu, crop)
-
-
 @pytest.mark.parametrize("name", OTHERS)
 def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
     scene, view = cloud(2000, seed=13), camera(200, 120)
@@ -229,33 +209,6 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_python_threads_can_share_a_rasterizer(name: str) -> None:
-    scene, view = cloud(500, seed=14), camera()
-    colors, pixels = colors_of(scene), pixels_like(view)
-    rasterizer = make_rasterizer(name, scene)
-    image, gradient = rasterizer.render(colors, view), rasterizer.color_gradient(pixels, view)
-    with ThreadPoolExecutor(4) as pool:
-        images = [pool.submit(rasterizer.render, colors, view) for _ in range(8)]
-        gradients = [pool.submit(rasterizer.color_gradient, pixels, view) for _ in range(8)]
-    assert all(torch.equal(f.result(), image) for f in images)
-    assert all(torch.equal(f.result(), gradient) for f in gradients)
-
-
-@pytest.mark.parametrize("background", [BLACK, (1.0, 1.0, 1.0), (0.2, 0.5, 0.9)])
-def test_background_fills_uncovered_pixels(background: tuple[float, float, float]) -> None:
-    scene, view = cloud(100, seed=15), camera()
-    colors, filling = colors_of(scene), torch.tensor(background)
-    for name in OTHERS:
-        over = make_rasterizer(name, scene, background=background)
-        coverage = over.coverage(view)
-        expected = make_rasterizer(name, scene).render(colors, view) + (1 - coverage)[..., None] * filling
-        assert torch.allclose(over.render(colors, view), expected, atol=1e-6)
-        assert 0 < float(coverage.max()) < 1
-        assert float(coverage.min()) == 0
-        assert torch.equal(over.render(colors, view)[coverage == 0].unique(dim=0), filling[None])
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -314,16 +267,6 @@ def test_tile_intersections_beyond_the_budget_are_cached_for_the_last_view_only(
     assert cpu.intersections(views[0]) is cached[0]
     assert cpu.intersections(views[2]) is cached[2]
     assert cpu.intersections(views[1]) is not cached[1]
-
-
-def test_arguments_are_checked_before_any_work() -> None:
-    scene, view = cloud(10), camera()
-    for name in ALL:
-        rasterizer = make_rasterizer(name, scene)
-        with pytest.raises(ValueError, match="colors of shape"):
-            rasterizer.render(torch.zeros(9, 3), view)
-        with pytest.raises(ValueError, match="image gradient of shape"):
-            rasterizer.color_gradient(torch.zeros(45, 70, 3), view.cropped(0, 0, 10, 70))
 
 
 def test_unknown_rasterizers_and_devices_are_refused() -> None:

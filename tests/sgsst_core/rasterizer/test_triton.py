@@ -4,8 +4,6 @@ The interpreter executes the kernels' source on CPU tensors. `benchmarks.triton_
 for real targets, and needs no GPU either.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re
@@ -24,12 +22,12 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import Rasterizer, drawing_problem, make_rasterizer
 from sgsst_core.rasterizer.projection import build_tile_intersections
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
+from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
 from tests.sgsst_core.rasterizer.references import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, is_cached, pixels_like, rotated_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, pixels_like, rotated_pose
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
@@ -148,34 +146,6 @@ def test_invalid_gaussians_are_dropped_as_by_reference() -> None:
     assert float((on_device(broken).render(colors_of(scene), view).cpu() - expected).abs().max()) < 1e-5
 
 
-def test_tile_intersections_beyond_the_budget_are_cached_for_the_last_view_only() -> None:
-    scene, views = cloud(50), [camera(33, 20), camera(20, 33)]
-    rasterizer = on_device(scene, max_intersection_bytes=0)
-    first = rasterizer.intersections(views[0])
-    assert rasterizer.intersections(views[0]) is first
-    rasterizer.intersections(views[1])
-    assert rasterizer.intersections(views[0]) is not first
-
-
-def test_weights_and_tile_intersections_share_a_budget() -> None:
-    scene = cloud(40)
-    views = [camera(17, 12, pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2)]
-    separate = on_device(scene)
-    weights = [separate.count_weights(view).nbytes("float32") for view in views]
-    isects = [separate.intersections(view).nbytes for view in views]
-    budget = max(sum(weights[:2]) + isects[2], sum(isects))
-    rasterizer = on_device(scene, **TritonRasterizer.options(budget))
-    cached = CachedRasterizer(scene, max_bytes=budget, uncached=rasterizer)
-    for view in views:
-        rasterizer.intersections(view)
-    assert rasterizer._intersections.used == sum(isects)
-    for done, view in enumerate(views, start=1):
-        cached.render(colors_of(scene), view)
-        assert is_cached(cached, view) is (sum(weights[:done]) <= budget)
-        assert cached.cached_bytes + rasterizer._intersections.used <= budget
-    assert cached.cached_bytes > 0
-
-
 def test_too_many_intersections_are_refused_before_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sgsst_core.rasterizer.projection.MAX_INTERSECTIONS", 10)
     with pytest.raises(TooManyIntersectionsError, match="raster tiles"):
@@ -187,11 +157,6 @@ def test_trial_render_returns_the_reason_of_a_failure(monkeypatch: pytest.Monkey
     monkeypatch.setattr(TritonRasterizer, "render", lambda *arguments: torch.zeros(16, 16, 3))
     assert drawing_problem("triton", DEVICE) == "it draws nothing"
     assert "no rasterizer is called 'none'" in str(drawing_problem("none"))  # type: ignore[arg-type]
-
-
-def test_rasterizer_is_created_by_name() -> None:
-    assert make_rasterizer("triton", cloud(10), device=DEVICE).name == "triton"
-    assert make_rasterizer("triton", cloud(10)).device.type == DEVICE
 
 
 @pytest.mark.slow

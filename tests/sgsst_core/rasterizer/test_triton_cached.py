@@ -3,21 +3,15 @@
 Tests that hold for both run with recomputed weights too.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.planning.facts import count_weights
 from sgsst_core.quality.measure import approximations
-from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.base import Precision, Rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
@@ -95,19 +89,6 @@ def test_images_and_gradients_agree_with_reference(case: tuple[Scene, Camera]) -
         assert is_cached(cached, view)
 
 
-def test_half_precision_weights_are_within_rounding_error() -> None:
-    """The bound holds down to the smallest weights, of a faint Gaussian behind opaque ones."""
-    scene, view = cloud(100, seed=7, log_scale=-1.0), camera(18, 11)
-    counted = cached_on_device(scene).count_weights(view)
-    exact, half = (counted.store(form) for form in ERRORS)
-    weights = exact.weights.double()  # type: ignore[attr-defined]
-    rounded = half.weights.double() / half.scale  # type: ignore[attr-defined]
-    # On a GPU the exact weights come from another kernel, which may round differently.
-    assert bool(((rounded - weights).abs() <= (2**-11 + 1e-6) * weights).all())
-    assert 0 < float(weights[weights > 0].min()) < 1e-5
-    assert half.weights.dtype == torch.float16  # type: ignore[attr-defined]
-
-
 def test_gradient_is_transpose_and_reproducible(precision: Precision | None) -> None:
     scene, view = cloud(60, seed=15), camera(20, 17)
     rasterizer, colors, pixels = with_weights(scene, precision), colors_of(scene), pixels_like(view)
@@ -167,80 +148,11 @@ def test_weights_beyond_the_budget_are_recomputed_on_the_device() -> None:
     assert alone.cached_bytes == alone.count_weights(crop).nbytes(alone.precision)
 
 
-def test_pieces_have_weights_and_slots_are_filled_once() -> None:
-    scene, view = cloud(80, seed=21), camera(20, 17)
-    weights: Any = cached_on_device(scene).count_weights(view).store("float32")
-    assert bool((weights.weights.view(-1, 16).amax(1) > 0).all())
-    pieces = len(weights.piece_slots)
-    assert torch.equal(weights.piece_slots.sort().values.cpu(), torch.arange(pieces, dtype=torch.int32))
-    lengths = weights.first_slots.diff().long()
-    owners = torch.repeat_interleave(weights.gaussians, lengths)
-    assert torch.equal(owners[weights.piece_slots.long()], weights.piece_gaussians)
-
-
-@contextmanager
-def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Yield a list that collects the names of calls that would synchronize with a GPU."""
-    waiting: list[str] = []
-
-    def noted(name: str) -> Callable[..., Any]:
-        original = getattr(Tensor, name)
-
-        def call(*arguments: Any, **options: Any) -> Any:
-            waiting.append(name)
-            return original(*arguments, **options)
-
-        return call
-
-    with monkeypatch.context() as patch:
-        for name in ("item", "tolist", "nonzero", "__bool__", "__int__", "__float__", "__index__"):
-            patch.setattr(Tensor, name, noted(name))
-        yield waiting
-
-
-def test_caching_synchronizes_once_and_cached_views_never(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Intersections wait for their length, and weights for the number of pieces."""
-    scene, view = cloud(60, seed=22), camera(20, 17)
-    cached, colors, pixels = cached_on_device(scene), colors_of(scene).to(DEVICE), pixels_like(view).to(DEVICE)
-    uncached: Any = cached.uncached
-    uncached.intersections(view)
-    with waits(monkeypatch) as waiting:
-        cached.coverage(view)
-    assert waiting == ["__int__"]
-    with waits(monkeypatch) as waiting:
-        cached.color_gradient(cached.render(colors, view) + pixels, view)
-    assert not waiting
-
-
-def test_rasterizer_is_created_by_name() -> None:
-    scene = cloud(10)
-    uncached = make_rasterizer("triton", scene, device=DEVICE)
-    rasterizer: Any = make_rasterizer("cached", scene, uncached=uncached)
-    assert (rasterizer.device, rasterizer.uncached) == (uncached.device, uncached)
-    if DEVICE == "cuda":
-        on_gpu: Any = make_rasterizer("cached", scene, device="cuda")
-        assert isinstance(on_gpu.uncached, TritonRasterizer)
-
-
 # --- plan and job --------------------------------------------------------------------------------------------------
 
 
 #: So small that a step in the interpreter takes only seconds.
 VIEWS = cameras(2, 32, 24)
-
-
-@pytest.mark.slow
-def test_bytes_of_cached_weights_are_counted() -> None:
-    scene = ball(60)
-    uncached = on_device(scene)
-    counted = count_weights(uncached, VIEWS)
-    assert counted is not None
-    for precision, size in zip(ERRORS, counted, strict=True):
-        cached = CachedRasterizer(scene, precision=precision, uncached=uncached)
-        for view in VIEWS:
-            cached.coverage(view)
-        assert cached.cached_bytes == size
-    assert count_weights(make_rasterizer("cpu", scene), VIEWS) is None
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Sample report with the structure that `build_report` gives, created without running a job."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tests of the JSON document of a report, and of the contact sheet."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -154,15 +152,6 @@ def test_initial_loss_of_zero_has_no_ratio(finished: tuple[Stylizer, Evaluation,
     assert loss_text(0.0, 0.0) == "0 before, 0 after"
     assert loss_text(4.0, 1.0) == "4 before, 1 after (25.0%)"
     assert "(150.0%); it has risen" in loss_text(2.0, 3.0)
-
-
-def test_loss_over_time_needs_steps(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
-    stylizer = finished[0]
-    history, stylizer.history = stylizer.history, []
-    try:
-        assert loss_over_time(stylizer, {0: LossTerms(gram=8.0)}) is None
-    finally:
-        stylizer.history = history
 
 
 def test_contact_sheet_shows_the_stylized_views(

@@ -1,7 +1,5 @@
 """Tests of cameras, camera paths and lenses."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace
@@ -230,12 +228,6 @@ def test_jitter_at_stations_does_not_change_the_timing(origin, jitter):
     assert len(neighbors(shaken)) == len(neighbors(still)) == 23
 
 
-def test_knots_are_centripetal_where_cameras_move():
-    centers = np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0], [5, 9, 0]], dtype=np.float64)
-    steps = np.diff(CameraPath([posed(center) for center in centers]).knots)
-    assert np.allclose(steps, np.sqrt(np.array([1, 4, 9]) / 4))
-
-
 def test_rotations_are_rotations_at_constant_speed_between_cameras():
     path = CameraPath([posed((0, 0, 0), rotated(10)), posed((1, 0, 0), rotated(70))])
     frames = path.evenly(7)
@@ -262,14 +254,6 @@ def test_one_camera_stands_still():
 def test_two_cameras_are_joined_by_a_straight_line():
     frames = CameraPath([posed((0, 0, 0)), posed((4, 2, 0))]).evenly(5)
     assert np.allclose([c.center.numpy() for c in frames], np.linspace((0, 0, 0), (4, 2, 0), 5))
-
-
-def test_coinciding_cameras_count_once():
-    a, b = posed((0, 0, 0)), posed((2, 0, 0), rotated(20))
-    path = CameraPath([a, a, b, replace(b, name="again"), b])
-    assert len(path.cameras) == 2
-    assert np.isfinite(poses(path.evenly(9))).all()
-    assert len(CameraPath([a, a]).evenly(3)) == 3
 
 
 def test_a_camera_that_turns_or_zooms_in_place_takes_time():

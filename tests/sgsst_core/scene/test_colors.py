@@ -1,7 +1,5 @@
 """Tests of color constraints and of the image pyramid."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np
@@ -172,15 +170,6 @@ HIGHEST = 0.5 / SH_C0
 
 def colors_of(sh_dc: torch.Tensor) -> torch.Tensor:
     return 0.5 + SH_C0 * sh_dc.double()
-
-
-def test_bound_is_the_largest_float32_within_range() -> None:
-    bound = torch.tensor([LARGEST])
-    beyond = torch.nextafter(bound, torch.tensor([torch.inf]))
-    assert float(colors_of(bound)) <= 1
-    assert float(colors_of(-bound)) >= 0
-    assert float(colors_of(beyond)) > 1
-    assert float(colors_of(-beyond)) < 0
 
 
 @given(st.lists(COLOR, min_size=1, max_size=8))

@@ -1,7 +1,5 @@
 """Tests of panoramas: directions of pixels, faces taken from a panorama, and panoramas made of faces."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -16,7 +14,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.files.photos import undistort
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.scene.camera import Camera, look_at, resized, undistorted
+from sgsst_core.scene.camera import Camera, look_at, undistorted
 from sgsst_core.scene.panorama import FACES, OVERLAP, cube_faces, faces_to_render, join_faces, level
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.objects import ball, scene_of
@@ -102,20 +100,6 @@ def test_directions_of_pixels_match_colmap() -> None:
     camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=64, height=32, params=[64, 32])
     expected = [[camera.cam_ray_from_img([x + 0.5, y + 0.5]) for x in range(64)] for y in range(32)]
     assert np.allclose(directions(64).numpy(), np.array(expected), atol=1e-12)
-
-
-def test_faces_of_a_photo_have_no_half_pixel_offset() -> None:
-    """A panorama of its own directions: half a pixel would be an error of 0.006."""
-    photo = directions(512).float()
-    for face in cube_faces("a", 512, 256, POSE):
-        assert float((undistort_signed(photo, face) - rays(face)).abs().max()) < 1e-4
-        small = resized(face, 60)
-        assert float((undistort_signed(photo, small) - rays(small)).abs().max()) < 2e-3
-
-
-def undistort_signed(photo: Tensor, face: Camera) -> Tensor:
-    """Return the face of a photo with values in -1..1."""
-    return 2 * undistort((photo + 1) / 2, face).double() - 1
 
 
 def test_sampled_faces_match_a_loop_over_pixels() -> None:

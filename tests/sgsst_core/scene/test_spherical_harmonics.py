@@ -1,17 +1,29 @@
-"""Tests of spherical harmonics: the basis functions, the clamp and its gradient, and scenes far from the origin."""
-
-from __future__ import annotations
+"""Tests of spherical harmonics: the basis, the clamp and its gradient, and coefficients that are read on demand."""
 
 import math
+import os
+import pickle
+import subprocess
+import sys
+import textwrap
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
-from sgsst_core.scene import spherical_harmonics
+from sgsst_core.errors import SceneError
+from sgsst_core.files import scene_file, stylized_ply
+from sgsst_core.files.formats import scene_format
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
+from sgsst_core.scene import spherical_harmonics, stored_harmonics
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import (
@@ -24,7 +36,7 @@ from sgsst_core.scene.spherical_harmonics import (
     view_colors_gradient,
     view_directions,
 )
-from sgsst_core.scene.stored_harmonics import held
+from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
 
@@ -49,13 +61,6 @@ def _gauss(count: int) -> tuple:
     import numpy as np
 
     return np.polynomial.legendre.leggauss(count)
-
-
-def test_basis_is_orthonormal() -> None:
-    directions, weights = sphere()
-    values = torch.cat([torch.full((len(directions), 1), SH_C0, dtype=torch.float64), basis(directions, 3)], dim=1)
-    products = values.T @ (weights[:, None] * values)
-    assert torch.allclose(products, torch.eye(16, dtype=torch.float64), atol=1e-12)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -217,3 +222,236 @@ def test_wrong_number_of_coefficients_is_refused() -> None:
         rest_colors(torch.zeros(5, 4, 3), scene.means, view)
     with pytest.raises(ValueError, match="degree 4"):
         basis(torch.zeros(1, 3), 4)
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reduce the block size, so that small scenes have many blocks, including incomplete ones."""
+    monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
+    monkeypatch.setattr(scene_file, "READ_BYTES", 3000)
+    for module in (scene_format, stylized_ply):
+        monkeypatch.setattr(module, "BLOCK_ROWS", 17)
+
+
+def both(path: Path, *, drop: bool = False) -> tuple[Scene, Scene]:
+    """Read a scene file twice: with SH coefficients left in the file, and with SH coefficients in memory."""
+    stored = read_scene(path, drop_invalid=drop, held_bytes=0).scene
+    plain = read_scene(path, drop_invalid=drop).scene
+    assert isinstance(stored.sh_rest, StoredHarmonics)
+    assert isinstance(plain.sh_rest, Tensor)
+    return stored, plain
+
+
+def written(folder: Path, count: int = 100, degree: int = 3) -> Path:
+    write_scene(folder / "scene.ply", cloud(count, degree=degree))
+    return folder / "scene.ply"
+
+
+def rewritten(path: Path, comment: bytes, extra: tuple[str, ...], position: int, elements: bytes) -> None:
+    """Write another file of the same scene, with a comment, extra properties or additional leading elements."""
+    raw = path.read_bytes()
+    head, _, body = raw.partition(b"end_header\n")
+    old = np.frombuffer(body, [(line.split()[-1].decode(), "<f4") for line in head.splitlines() if b"property" in line])
+    columns = [(name, "<f4") for name in old.dtype.names or ()]
+    columns[position:position] = [(f"extra_{i}", kind) for i, kind in enumerate(extra)]
+    rows = np.zeros(len(old), columns)
+    for name in old.dtype.names or ():
+        rows[name] = old[name]
+    kinds = {"<f4": "float", "<f8": "double", "u1": "uchar", "<u2": "ushort"}
+    lines = [f"property {kinds[kind]} {name}".encode() for name, kind in columns]
+    front = [b"element front 3", b"property uchar v"] if elements else []
+    top = [b"ply", b"format binary_little_endian 1.0", b"comment " + comment, *front]
+    top += [f"element vertex {len(rows)}".encode(), *lines, b"end_header", b""]
+    path.write_bytes(b"\n".join(top) + elements + rows.tobytes() + b"behind")
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    count=st.integers(1, 60),
+    degree=st.integers(1, 3),
+    comment=st.binary(max_size=7).map(lambda text: text.replace(b"\n", b" ").replace(b"\r", b" ")),
+    extra=st.sampled_from([(), ("<f4",), ("<f8",), ("u1", "u1", "<u2")]),
+    position=st.integers(0, 9),
+    elements=st.sampled_from([b"", b"\x01\x02\x03"]),
+    mask=st.integers(0, 2**60 - 1),
+)
+def test_stored_harmonics_of_any_layout_equal_those_in_memory(
+    tmp_path_factory: pytest.TempPathFactory,
+    count: int,
+    degree: int,
+    comment: bytes,
+    extra: tuple[str, ...],
+    position: int,
+    elements: bytes,
+    mask: int,
+) -> None:
+    path = written(tmp_path_factory.mktemp("stored"), count, degree)
+    rewritten(path, comment, extra, position, elements)
+    stored, plain = both(path)
+    view = camera(pose=rotated_pose())
+    for name in ("means", "quats", "scales", "opacities", "sh_dc"):
+        assert torch.equal(getattr(stored, name), getattr(plain, name))
+    assert torch.equal(held(stored.sh_rest), held(plain.sh_rest))
+    assert torch.equal(*(rest_colors(scene.sh_rest, scene.means, view) for scene in (stored, plain)))
+    rows = torch.tensor([bool(mask >> i & 1) for i in range(count)])
+    some = [scene.subset(rows) for scene in (stored, plain)]
+    assert isinstance(some[0].sh_rest, StoredHarmonics)
+    assert torch.equal(held(some[0].sh_rest), held(some[1].sh_rest))
+    assert torch.equal(*(rest_colors(scene.sh_rest, scene.means, view) for scene in some))
+    every_second = torch.arange(0, int(rows.sum()), 2)
+    assert torch.equal(*(held(scene.subset(every_second).sh_rest) for scene in some))
+    jumbled = torch.arange(count).flip(0).repeat(2)
+    assert torch.equal(*(held(scene.subset(jumbled).sh_rest) for scene in (stored, plain)))
+
+
+@pytest.mark.parametrize("change", ["big_endian", "doubles", "order", "text", "odd rows"])
+def test_unsupported_layouts_are_read_into_memory(tmp_path: Path, change: str) -> None:
+    path = written(tmp_path, 5, 1)
+    data = path.read_bytes()
+    expected = held(read_scene(path).scene.sh_rest)
+    head, _, body = data.partition(b"end_header\n")
+    names = [line.split()[-1].decode() for line in head.splitlines() if b"property" in line]
+    rows = np.frombuffer(body, [(name, "<f4") for name in names])
+    if change == "big_endian":
+        head = head.replace(b"little", b"big")
+        body = rows.astype(rows.dtype.newbyteorder(">")).tobytes()
+    elif change == "doubles":
+        head = head.replace(b"float f_rest_4", b"double f_rest_4")
+        body = rows.astype([(name, "<f8" if name == "f_rest_4" else "<f4") for name in names]).tobytes()
+    elif change == "order":
+        swapped = {"f_rest_3": "f_rest_5", "f_rest_5": "f_rest_3"}
+        head = head.replace(b"f_rest_3", b"?").replace(b"f_rest_5", b"f_rest_3").replace(b"?", b"f_rest_5")
+        body = np.array([tuple(row) for row in rows[[swapped.get(name, name) for name in names]]], "<f4").tobytes()
+    elif change == "text":
+        head = head.replace(b"binary_little_endian", b"ascii")
+        body = b"".join(b" ".join(repr(float(v)).encode() for v in row) + b"\n" for row in rows.tolist())
+    else:
+        head = head + b"property uchar odd\n"
+        body = b"".join(body[i * rows.itemsize : (i + 1) * rows.itemsize] + b"\x07" for i in range(len(rows)))
+    path.write_bytes(head + b"end_header\n" + body)
+    scene = read_scene(path, held_bytes=0).scene
+    assert isinstance(scene.sh_rest, Tensor)
+    assert torch.equal(scene.sh_rest, expected)
+
+
+@pytest.mark.parametrize(("last", "degree"), [(None, 0), (0, 1), (2, 1), (3, 2), (7, 2), (8, 3)])
+def test_zero_bands_are_removed_without_a_copy(tmp_path: Path, last: int | None, degree: int) -> None:
+    scene = cloud(100, degree=3)
+    values = torch.zeros(100, 15, 3)
+    if last is not None:
+        values[61, last, 2] = -1e-30
+    write_scene(tmp_path / "scene.ply", replace(scene, sh_rest=values))
+    for loaded in both(tmp_path / "scene.ply"):
+        less = loaded.without_zero_bands()
+        assert (loaded.used_degree(), less.sh_degree) == (degree, degree)
+        assert type(less.sh_rest) is type(loaded.sh_rest)
+        assert torch.equal(held(less.sh_rest), values[:, : (degree + 1) ** 2 - 1])
+        without = torch.ones(100, dtype=torch.bool)
+        without[61] = False
+        assert loaded.used_degree(without) == 0
+
+
+def test_invalid_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
+    scene = cloud(100, degree=2)
+    values = held(scene.sh_rest).clone()
+    values[3, 1, 2], values[70, 0, 0] = torch.nan, torch.inf  # f_rest_17 and f_rest_0
+    scene.opacities[70] = torch.nan
+    write_scene(tmp_path / "scene.ply", replace(scene, sh_rest=values))
+    messages = []
+    for held_bytes in (0, 1 << 28):
+        with pytest.raises(SceneError) as caught:
+            read_scene(tmp_path / "scene.ply", held_bytes=held_bytes)
+        messages.append(str(caught.value))
+    assert messages[0] == messages[1]
+    assert "2 of 100" in messages[0]
+    assert "opacity (1 NaN), f_rest_0 (1 infinite), f_rest_17 (1 NaN)" in messages[0]
+    stored, plain = both(tmp_path / "scene.ply", drop=True)
+    assert len(stored) == 98
+    assert torch.equal(held(stored.sh_rest), held(plain.sh_rest))
+    source = read_scene(tmp_path / "scene.ply", drop_invalid=True, held_bytes=0)
+    write_stylized(source, tmp_path / "out.ply", stored.sh_dc + 1)
+    again = read_scene(tmp_path / "out.ply").scene
+    assert torch.equal(held(again.sh_rest), held(plain.sh_rest))
+    assert torch.equal(again.sh_dc, stored.sh_dc + 1)
+
+
+@pytest.mark.parametrize("change", ["shortened", "emptied", "overwritten", "longer"])
+def test_changed_file_raises_an_error_instead_of_a_signal(tmp_path: Path, change: str) -> None:
+    path = written(tmp_path)
+    scene = both(path)[0]
+    size, data = path.stat().st_size, path.read_bytes()
+    if change == "shortened":
+        os.truncate(path, size // 2)
+    elif change == "emptied":
+        path.write_bytes(b"")
+    elif change == "overwritten":
+        path.write_bytes(data[:-4] + b"\0\0\0\0")
+        os.utime(path, ns=(0, 0))  # file systems may update times late
+    else:
+        path.write_bytes(data + b"\0")
+    with pytest.raises(SceneError, match="was changed after it was read"):
+        rest_colors(scene.sh_rest, scene.means, camera())
+
+
+def test_replaced_or_deleted_file_stays_readable(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    stored, plain = both(path)
+    (tmp_path / "other.ply").write_bytes(b"ply")
+    (tmp_path / "other.ply").replace(path)
+    path.unlink()
+    assert torch.equal(held(stored.sh_rest), held(plain.sh_rest))
+
+
+def test_other_process_opens_the_same_file_or_raises(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    stored, plain = both(path)
+    assert isinstance(stored.sh_rest, StoredHarmonics)
+    some = stored.sh_rest[torch.arange(0, 100, 3)]
+    packed = pickle.dumps(some)
+    assert torch.equal(held(pickle.loads(packed)), held(plain.sh_rest)[::3])
+    path.write_bytes(b"ply")
+    with pytest.raises(SceneError, match="was changed after it was read"):
+        pickle.loads(packed)
+
+
+_PEAK = textwrap.dedent("""
+    import sys
+    from pathlib import Path
+    import torch
+    from sgsst_core.files.scene_file import read_scene
+    from sgsst_core.files.stylized_ply import write_stylized
+    from sgsst_core.scene.spherical_harmonics import rest_colors
+    from tests.sgsst_core.splat_scenes import camera
+
+    def anonymous(what):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(what))
+
+    folder, path = Path(sys.argv[1]), Path(sys.argv[1]) / "large.ply"
+    small = read_scene(folder / "scene.ply", held_bytes=0).scene  # everything is imported and compiled
+    rest_colors(small.sh_rest, small.means, camera())
+    before = anonymous("RssAnon")
+    file = read_scene(path, held_bytes=0)
+    seen = torch.arange(len(file.scene)) % 10 > 0
+    shown = file.scene.subset(seen).without_zero_bands()
+    colors = rest_colors(shown.sh_rest, shown.means, camera())
+    Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
+    write_stylized(file, folder / "out.ply", file.scene.sh_dc + 1)
+    print((anonymous("RssAnon") - before) // len(file.scene), (anonymous("VmHWM") - anonymous("VmRSS")))
+""")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is looked for in Linux's /proc")
+def test_neither_harmonics_nor_result_are_in_memory(tmp_path: Path) -> None:
+    """A Gaussian takes 56 bytes, in the subset again, plus 12 for its color and 4 for its row; SH would take 180."""
+    write_scene(tmp_path / "scene.ply", cloud(10, degree=3))
+    count, one = 300_000, cloud(3000, degree=3)
+    write_scene(tmp_path / "large.ply", one.subset(torch.arange(3000).repeat(count // 3000)))
+    run = [sys.executable, "-c", _PEAK, str(tmp_path)]
+    output = subprocess.run(
+        run, capture_output=True, text=True, check=True, cwd=Path(scene_file.__file__).parents[2]
+    ).stdout
+    held_bytes, writing = map(int, output.split())
+    assert held_bytes < 236  # a scene in memory without its subset
+    assert writing < 40 << 20  # one block of rows plus the comparison of its colors; the file has 74 MB

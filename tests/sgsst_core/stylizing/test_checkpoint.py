@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from sgsst_core.errors import CheckpointError, OutputError
+from sgsst_core.errors import CheckpointError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Plan, Work
@@ -180,21 +178,6 @@ def test_checkpoint_of_another_run_is_refused(full_checkpoint: Checkpoint, tmp_p
     assert checkpoints.load("job", pytest.fail, "run").run == "run"
     with pytest.raises(CheckpointError, match="earlier run"):
         checkpoints.load("job", pytest.fail, "another run")
-
-
-def test_full_disk_is_an_output_error_and_preserves_checkpoint(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
-    resource = pytest.importorskip("resource")
-    checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
-    checkpoints.save(full_checkpoint, "job")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    try:
-        with pytest.raises(OutputError, match="Free some space"):
-            checkpoints.save(full_checkpoint, "job")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert [path.name for path in tmp_path.iterdir()] == [checkpoints.latest.name]
-    assert load_checkpoint(checkpoints.latest, "job").state.step == 2
 
 
 def test_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:

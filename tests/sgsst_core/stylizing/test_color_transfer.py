@@ -1,14 +1,10 @@
 """Tests of transfers of the style's colors: before the first step, in previews, and after the last step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
@@ -20,7 +16,6 @@ from sgsst_core.settings import Settings, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.color_transfer import (
     _drawn,
-    _round_axes,
     _rounds,
     _through,
     _through_compiled,
@@ -123,9 +118,6 @@ def test_flat_scenes_and_styles_give_finite_colors_in_range(case: str, start: St
     torch.testing.assert_close(colors.mean(0), expected, rtol=0, atol=0.06)  # clamping changes the mean slightly
 
 
-Array = NDArray[np.float64]
-
-
 def colors(count: int, seed: int) -> Tensor:
     """Return two clusters of colors, one of them long and thin."""
     generator = torch.Generator().manual_seed(seed)
@@ -137,23 +129,6 @@ def colors(count: int, seed: int) -> Tensor:
 
 def weights(count: int, seed: int) -> Tensor:
     return torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** 4
-
-
-def plain(moved: Array, weight: Array, wanted: Array) -> Array:
-    """Transport all colors by a reference implementation without sampling and interpolation.
-
-    Along each direction, a value is replaced by the target value at the same cumulative weight.
-    """
-    moved = moved.copy()
-    for axes in (rotation.numpy() for rotation in _round_axes()):
-        rotated, targets = moved @ axes, np.sort(wanted @ axes, axis=0)
-        for axis in range(3):
-            order = np.argsort(rotated[:, axis])
-            share = np.cumsum(weight[order]) - 0.5 * weight[order]
-            places = np.linspace(0, weight.sum(), len(targets))
-            rotated[order, axis] = np.interp(share, places, targets[:, axis])
-        moved = rotated @ axes.T
-    return moved
 
 
 def distance(first: Tensor, second: Tensor) -> float:
@@ -178,15 +153,6 @@ def test_weighted_colors_get_the_target_distribution(scale: float) -> None:
     actual = transported(own, count, wanted)
     assert distance(sampled(own, count), wanted) > 0.1
     assert distance(sampled(actual, count), wanted) < 0.01
-
-
-def test_equal_colors_stay_equal_and_zero_weights_are_ignored() -> None:
-    own, count, wanted = colors(500, 7), weights(500, 8), colors(500, 9)
-    more = torch.cat([own, own[:100], 5 - own])
-    less = torch.cat([count, torch.zeros(600, dtype=torch.float64)])
-    actual = transported(more, less, wanted)
-    torch.testing.assert_close(actual[:500], transported(own, count, wanted), rtol=0, atol=1e-12)
-    torch.testing.assert_close(actual[500:600], actual[:100], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("case", ["heaps", "far", "flat", "two"])

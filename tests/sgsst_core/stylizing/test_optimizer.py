@@ -1,7 +1,5 @@
 """Tests of the optimizer: Adam, colors in range, in a subspace, or with their own chroma."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -12,8 +10,6 @@ from torch import Tensor
 from benchmarks.stability.sos_reference import sos_reference
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.sos import SosLoss
 from sgsst_core.quality.judge import saturated
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.regions import Region, Regions
@@ -264,25 +260,6 @@ def test_gradient_is_the_derivative_by_luminance(tiny_weights: BackboneWeights) 
     exact = rasterizer.color_gradient(pixels, view) * SH_C0 * (colors > 0)
     assert stylizer.job.weights.gray
     assert relative_error(actual.sum(1).double(), exact.sum(1)[stylizer.job.plan.seen]) < 1e-4
-
-
-def test_tiles_agree_with_untiled_autograd(tiny_weights: BackboneWeights) -> None:
-    weights = replace(tiny_weights, gray=True)
-    image, content, painting = (
-        synthetic_image(129, 161, seed=1),
-        synthetic_image(129, 161, seed=2),
-        synthetic_image(100, 120, seed=3),
-    )
-    painting = resize_area(painting, style_size((100, 120), (129, 161)))
-    coverage = (synthetic_image(129, 161, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
-    expected, gradient = sos_reference(weights, image, painting, content, coverage=coverage, coarsest=70)
-    for tile_size in (None, 64):
-        loss = SosLoss(FeatureNetwork(weights, dtype=torch.float64), tile_size=tile_size, coarsest=70)
-        targets = loss.targets.of_style(Style.of(painting), (129, 161))
-        actual = loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
-        assert actual.loss == pytest.approx(expected, rel=1e-9)
-        assert actual.image_gradient is not None
-        assert relative_error(actual.image_gradient, gradient) < 1e-9
 
 
 def test_style_gets_the_luminance_of_the_scene() -> None:

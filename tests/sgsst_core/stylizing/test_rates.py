@@ -1,7 +1,5 @@
 """Tests of rates that jobs leave behind, of estimates from them, and of the remaining time that a job shows."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of refining a scene of large Gaussians: images hardly change, and only large Gaussians are split."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -14,6 +12,8 @@ from sgsst_core.planning.survey import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import MIN_PSNR, Footprints, Refinement, parents_of, piece_counts
+from sgsst_core.regions import Region, Regions
+from sgsst_core.scene.colors import luminance
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.settings import Settings, make_settings
 from sgsst_core.style import Style
@@ -174,3 +174,55 @@ def on_a_rank(collectives: Collectives, factor: float) -> Refinement | None:
         JobInputs(large_wall(), cameras(), Style.of(style()), settings(refine=factor), weights=weights),
         collectives=collectives,
     )
+
+
+def halves() -> Regions:
+    """Return regions of the wall: the left is frozen, the right has its own style, and the rest is background."""
+    across = large_wall().means[:, 0]
+    labels = torch.zeros(len(across), dtype=torch.uint8)
+    labels[across < -0.5], labels[across > 0.5] = 1, 2
+    own = Style.weighted([style().flip(0), style().flip(2)], [1, 3])
+    return Regions((Region("rest"), Region("left", freeze=True), Region("right", style=own, weight=2.0)), labels)
+
+
+def job(weights: BackboneWeights, **values: object) -> Stylizer:
+    settings = make_settings("preview", steps_coarse=1, steps_sos=2, measure=0, coarsest_side=24, **values)
+    both = Style.weighted([style(), style().flip(1)], [2, 1])
+    return Stylizer.planned(large_wall(), cameras(), both, settings, weights=weights, regions=halves())
+
+
+def stylized(stylizer: Stylizer) -> torch.Tensor:
+    while stylizer.step < stylizer.job.total_steps:
+        stylizer.run_step()
+    return stylizer.stylized()
+
+
+def test_frozen_gaussians_are_not_split_and_children_keep_regions(tiny_weights: BackboneWeights) -> None:
+    settings, regions = make_settings("preview", refine=2.0), halves()
+    free = refine(JobInputs(large_wall(), cameras(), Style.of(style()), settings, weights=tiny_weights))
+    refinement = refine(
+        JobInputs(large_wall(), cameras(), Style.of(style()), settings, weights=tiny_weights, regions=regions)
+    )
+    assert free is not None
+    assert refinement is not None
+    assert bool((piece_counts(free.pieces)[regions.frozen] > 1).any()), "nothing is proved"
+    assert bool((piece_counts(refinement.pieces)[regions.frozen] == 1).all())
+    assert refinement.split
+    assert torch.equal(regions.refined(refinement).labels, regions.labels[parents_of(refinement.pieces)])
+
+
+def test_all_controls_work_together(tiny_weights: BackboneWeights) -> None:
+    values = {"refine": 2.0, "preserve_colors": "luminance", "scales": (1.0, 0.5), "warm_start": True}
+    stylizer = job(tiny_weights, **values)
+    before = stylizer.job.scene.sh_dc.clone()
+    stylized_colors = stylized(stylizer)
+    assert len(stylized_colors) > len(large_wall())
+    assert stylizer.job.regions is not None
+    frozen = stylizer.job.regions.frozen
+    assert torch.equal(stylized_colors[frozen], before[frozen])
+    assert not torch.equal(stylized_colors[~frozen], before[~frozen])
+    assert bool(stylized_colors.isfinite().all())
+    change = stylized_colors.double() - before.double()
+    assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
+    assert float(luminance(change).abs().max()) > 0.01
+    assert torch.equal(stylized(job(tiny_weights, **values)), stylized_colors)

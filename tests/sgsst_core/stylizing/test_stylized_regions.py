@@ -1,7 +1,6 @@
-"""Tests of jobs with regions: frozen regions do not change, and others approach their own styles."""
+"""Tests of jobs with regions, and with several styles: frozen regions do not change, others approach their styles."""
 
-from __future__ import annotations
-
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +9,21 @@ import pytest
 import torch
 from torch import Tensor
 
+from sgsst_core.constants import SH_C0
+from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions import Region, RegionMaps, Regions
+from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import make_settings
+from sgsst_core.settings import MAX_RESOLUTION, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, fingerprint, load_checkpoint, versions
-from sgsst_core.stylizing.job import JobInputs, prepare_job
+from sgsst_core.stylizing.job import JobInputs, check_style_size, prepare_job, prepared_style, rotated
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.stylizer import Stylizer, neighbors_change_by_region, transferred_colors
+from sgsst_core.stylizing.stylizer import Stylizer, neighbors_change_by_region
 from tests.small_scenes import ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -127,20 +131,6 @@ def test_each_region_approaches_its_own_style(tiny_weights: BackboneWeights) -> 
     assert left < 0.4 < 0.6 < right
 
 
-def test_warm_start_uses_the_style_of_each_region(tiny_weights: BackboneWeights) -> None:
-    scene = wall()
-    dark, bright = torch.full((40, 40, 3), 0.2), torch.full((40, 40, 3), 0.7)
-    regions = halves(scene, right=Region("right", style=Style.of(bright)))
-    stylizer = make(tiny_weights, scene, regions, dark, warm_start=True)
-    seen = stylizer.job.plan.optimized
-    colors = 0.5 + 0.28209479 * transferred_colors(stylizer.job)
-    for place, gray in enumerate((0.2, 0.7)):
-        torch.testing.assert_close(
-            colors[regions.labels[stylizer.job.plan.seen] == place].mean(), torch.tensor(gray), atol=1e-3, rtol=0
-        )
-    assert bool(seen.any())
-
-
 # --- resuming, reference and plan ----------------------------------------------------------------------------------
 
 
@@ -190,3 +180,98 @@ def test_fingerprint_depends_on_regions() -> None:
     fingerprints = [fingerprint(scene, views, Style.of(style()), settings, "w", "", each) for each in every]
     assert len(set(fingerprints)) == len(every)
     assert fingerprints[0] == fingerprint(scene, views, Style.of(style()), settings, "w")
+
+
+def synthetic_image(height: int = 40, width: int = 60) -> torch.Tensor:
+    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
+
+
+def ramp(height: int, width: int, slope_y: float, slope_x: float) -> torch.Tensor:
+    """Return an image with a linear gradient and the value 0.5 at its center."""
+    y = torch.arange(height) - (height - 1) / 2
+    x = torch.arange(width) - (width - 1) / 2
+    return (0.5 + slope_y * y[:, None] + slope_x * x).unsqueeze(2).expand(-1, -1, 3).contiguous()
+
+
+def test_rotations_by_90_degrees_only_move_pixels() -> None:
+    style = synthetic_image()
+    assert torch.equal(rotated(style, 90), torch.rot90(style, 1, (0, 1)))
+    assert torch.equal(rotated(style, -90), torch.rot90(style, -1, (0, 1)))
+    assert torch.equal(rotated(style, 360), style)
+    assert rotated(style, 180).is_contiguous()
+
+
+@pytest.mark.parametrize("degrees", [1, 17, 45, 89, 107, -30, 200])
+@pytest.mark.parametrize("size", [(80, 80), (60, 150), (150, 60)])
+def test_brightness_ramp_rotates_with_the_image(degrees: float, size: tuple[int, int]) -> None:
+    """Every pixel comes from inside the image: edges are not extended and nothing is filled in."""
+    height, width = size
+    image = rotated(ramp(height, width, 0.001, 0.002), degrees)[..., 0]
+    angle = math.radians(degrees)
+    # Counterclockwise, as seen with y pointing down: what was on the right moves up.
+    slope_x = 0.002 * math.cos(angle) + 0.001 * math.sin(angle)
+    slope_y = 0.001 * math.cos(angle) - 0.002 * math.sin(angle)
+    wanted = ramp(image.shape[0], image.shape[1], slope_y, slope_x)[..., 0]
+    shift = 0.0025  # the crop is half a pixel off center
+    torch.testing.assert_close(image - image.mean(), wanted - wanted.mean(), atol=1e-4, rtol=0)
+    assert abs(float(image.mean()) - 0.5) <= shift
+
+
+def test_matched_colors_have_the_scenes_mean_and_covariance() -> None:
+    generator = torch.Generator().manual_seed(1)
+    colors = 0.5 + 0.08 * torch.randn(5000, 3, generator=generator) @ torch.tensor(
+        [[1.0, 0.3, 0.0], [0.0, 1.0, 0.5], [0.0, 0.0, 0.4]]
+    )
+    weights = torch.rand(5000, generator=generator, dtype=torch.float64)
+    settings = make_settings("standard", preserve_colors="match")
+    style = 0.5 + 0.05 * torch.randn(64, 64, 3, generator=generator)
+    (image,) = prepared_style(Style.of(style), settings, (colors - 0.5) / SH_C0, weights).images
+    matched = image.reshape(-1, 3).double()
+    share = (weights / weights.sum())[:, None]
+    inside = colors.double().clamp(0, 1)
+    mean = (share * inside).sum(dim=0)
+    covariance = (share * (inside - mean)).T @ (inside - mean)
+    torch.testing.assert_close(matched.mean(dim=0), mean, atol=1e-4, rtol=0)
+    torch.testing.assert_close(matched.T.cov(correction=0), covariance, atol=1e-4, rtol=0)
+
+
+def test_uniform_style_gets_the_mean_of_the_scene() -> None:
+    settings = make_settings("standard", preserve_colors="match")
+    gray = Style.of(torch.full((4, 4, 3), 0.9))
+    (image,) = prepared_style(gray, settings, torch.zeros(10, 3), torch.ones(10).double()).images
+    torch.testing.assert_close(image, torch.full((4, 4, 3), 0.5))
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_style_scale_uses_statistics_of_a_resized_style(tiny_weights: BackboneWeights, scale: float) -> None:
+    style, view = synthetic_image(96, 120), (64, 96)
+    size = style_size((96, 120), view, scale)
+    assert size == (round(64 * scale), round(80 * scale))
+    network = FeatureNetwork(tiny_weights)
+    actual = SosLoss(network, style_scale=scale).targets.of_style(Style.of(style), view)[0][0]
+    wanted = SosLoss(network).targets.of_style(Style.of(resize_area(style, size)), size)[0][0]
+    for layer in actual.layers:
+        torch.testing.assert_close(actual.layers[layer].gram, wanted.layers[layer].gram)
+
+
+def test_style_size_has_the_limit_of_views() -> None:
+    (view,) = cameras()[:1]
+    line = Style.of(torch.zeros(1, 100, 3))
+    most = MAX_RESOLUTION / 100
+    check_style_size(line, [view], most)
+    check_style_size(Style.of(torch.zeros(1, MAX_RESOLUTION + 1, 3)), [view], 1)  # the style is never enlarged
+    with pytest.raises(SettingsError, match=rf"for views of {view.width} x {view.height}\. .* at most 16,384"):
+        check_style_size(line, [view], most + 0.1)
+
+
+def test_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
+    settings = make_settings("standard", style_rotation=90, preserve_colors="match", style_scale=2, coarsest_side=24)
+    scene, style = wall(), synthetic_image()
+    stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
+    (used,) = stylizer.job.style.images
+    assert used.shape == (60, 40, 3)
+    assert stylizer.job.loss.targets.style_scale == 2
+    weights = stylizer.job.plan.survey.total_blend_weights
+    (wanted,) = prepared_style(Style.of(style), settings, scene.sh_dc, weights).images
+    assert torch.equal(used, wanted)
+    stylizer.run_step()

@@ -1,26 +1,35 @@
 """Tests of the optimization loop, on tiny scenes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
 from torch import Tensor
 
+from sgsst_core.budget import Cache
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.files.images import Color
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.progress import Progress
+from sgsst_core.quality.measure import Difference
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scales import smoothed
+from sgsst_core.scene.colors import downscale
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import PresetName, make_settings
+from sgsst_core.settings import PlannedPrecision, PresetName, make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
+from sgsst_core.stylizing.job import JobInputs, prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.steps import mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests.sgsst_core.synthetic_images import synthetic_image
+from sgsst_core.stylizing.views import drawn_color, replace_background
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import HEIGHT, WIDTH, ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -78,18 +87,6 @@ def test_every_view_is_visited_once_per_round(tiny_weights: BackboneWeights, sce
     rounds = [[record.view for record in stylizer.history[i : i + 4]] for i in (0, 4, 8)]
     assert [sorted(views) for views in rounds] == [[0, 1, 2, 3]] * 3
     assert len({tuple(views) for views in rounds}) > 1
-
-
-def test_first_step_changes_seen_values_by_the_learning_rate(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    """Adam's first update is lr * sign(gradient), whatever the gradient's size."""
-    hidden = replace(scene, means=torch.cat([scene.means[:-10], scene.means[-10:] * torch.tensor([1.0, 1.0, -1.0])]))
-    stylizer = make(tiny_weights, hidden, views=1, learning_rate=0.05, bounded=False, warm_start=False)
-    stylizer.run_step()
-    assert not stylizer.job.plan.seen[-10:].any()
-    moved = (stylizer.sh_dc.detach() - hidden.sh_dc[stylizer.job.plan.seen]).abs()
-    moved = moved[moved > 0]
-    assert len(moved) > 0.3 * hidden.sh_dc.numel()
-    torch.testing.assert_close(moved, torch.full_like(moved, 0.05), rtol=1e-3, atol=0)
 
 
 def test_learning_rate_falls_exponentially_to_its_end(
@@ -268,3 +265,164 @@ def test_given_photos_are_the_content(tiny_weights: BackboneWeights, scene: Scen
     given = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights, photos=lambda index: photo)
     assert own.evaluate([0])[0]["content"] == 0
     assert given.evaluate([0])[0]["content"] > 0
+
+
+COLOR: Color = (0.2, 0.9, 0.4)
+
+
+def make_over_background(weights: BackboneWeights, scene: Scene, views: int = 3, **values: Any) -> Stylizer:
+    settings = make_settings(**{"steps_coarse": 3, "steps_sos": 5, "coarsest_side": 24, **values})
+    return Stylizer.planned(scene, cameras(views), style(), settings, weights=weights)
+
+
+# --- colors -------------------------------------------------------------------------------------------------------
+
+
+def test_color_depends_only_on_seed_step_and_view() -> None:
+    """One color is hard-coded, because it must be the same on every machine and with every version."""
+    image = Style.of(style())
+    assert drawn_color("random", 5, 7, 11, image) == (0.659657205637411, 0.3164479498593752, 0.6750821160034983)
+    colors = {
+        numbers: drawn_color("random", *numbers, image)
+        for numbers in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (2**63 - 1, 10**6, 300), (0, 11, 1), (0, 1, 11))
+    }
+    assert len(set(colors.values())) == len(colors)
+    assert all(drawn_color("random", *numbers, image) == color for numbers, color in colors.items())
+    assert drawn_color("background", 0, 0, 0, image) is None
+
+
+def test_palette_colors_are_those_of_style_pixels() -> None:
+    image = Style.of(torch.tensor([[[0.1, 0.2, 0.3], [0.9, 0.5, 0.0], [0.9, 0.5, 0.0]], [[1.0, 1.0, 1.0]] * 3]))
+    drawn = [drawn_color("palette", 0, step, 0, image) for step in range(3000)]
+    shares = {color: drawn.count(color) / len(drawn) for color in set(drawn)}
+    expected = {tuple(pixel.tolist()): 1 / 6 for pixel in image.images[0].reshape(-1, 3)}
+    expected |= {tuple(image.images[0][0, 1].tolist()): 2 / 6, (1.0, 1.0, 1.0): 3 / 6}
+    assert shares == pytest.approx(expected, abs=0.03)
+
+
+# --- images on the background --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [0, 2])
+def test_replaced_background_matches_a_render_with_it(scale: int) -> None:
+    scene, camera, present = ball(), cameras(1)[0], (0.7, 0.0, 0.3)
+    colors = torch.rand(len(scene), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    over, expected = (ReferenceRasterizer(scene, background=color).render(colors, camera) for color in (present, COLOR))
+    coverage = ReferenceRasterizer(scene).coverage(camera)
+    actual = replace_background(downscale(over, scale), downscale(coverage, scale), COLOR, present)
+    torch.testing.assert_close(actual, downscale(expected, scale), rtol=0, atol=1e-12)
+    assert replace_background(over.float(), coverage.float(), COLOR, present).dtype == torch.float32
+
+
+def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Color | None) -> tuple[Any, Any]:
+    target, targets = (
+        stylizer.job.view_targets.target(index, scales, behind),
+        stylizer.job.style_targets(stylizer.job.views.cameras[0]),
+    )
+    return stylizer.job.gradient(index, stylizer.sh_dc.detach(), targets, target, scales, behind)
+
+
+@pytest.mark.parametrize(("scales", "content"), [([0, 1], "cached"), ([1], "uncached")])
+def test_step_gradient_matches_a_job_with_its_background(
+    tiny_weights: BackboneWeights, scales: list[int], content: Literal["cached", "uncached"]
+) -> None:
+    """The content also gets the step's background, whether or not its images are cached."""
+    drawn = make_over_background(tiny_weights, ball(), training_background="random", background=(0.1, 0.1, 0.5))
+    fixed = make_over_background(tiny_weights, ball(), training_background="background", background=COLOR)
+    if content == "uncached":
+        drawn.job.view_targets._images = Cache(0, lambda _: 1)
+    with torch.no_grad():
+        drawn.sh_dc += 0.3
+        fixed.sh_dc.copy_(drawn.sh_dc)
+    for _ in range(2):
+        actual, loss = drawn_gradient(drawn, 1, scales, COLOR)
+        expected, exact = drawn_gradient(fixed, 1, scales, None)
+        assert loss.loss == pytest.approx(exact.loss, rel=1e-5)
+        assert loss.terms[scales[-1]]["content"] == pytest.approx(exact.terms[scales[-1]]["content"], rel=1e-3)
+        assert exact.terms[scales[-1]]["content"] > 0
+        assert relative_error(actual, expected) < 1e-4
+
+
+def test_photos_get_the_color_in_uncovered_pixels(tiny_weights: BackboneWeights) -> None:
+    photo = synthetic_image(HEIGHT, WIDTH, seed=9, dtype=torch.float32)
+    settings = make_settings(training_background="random", steps_sos=2)
+    stylizer = Stylizer.planned(ball(), cameras(1), style(), settings, weights=tiny_weights, photos=lambda _: photo)
+    coverage = stylizer.job.view_targets.coverage(0)[0][..., None]
+    content = coverage * photo + (1 - coverage) * torch.tensor(COLOR)
+    expected = stylizer.job.loss.targets.of_view(content, coverage[..., 0]).content[0]
+    actual = stylizer.job.view_targets.target(0, [0], COLOR).content[0]
+    for tile, features in expected.items():
+        torch.testing.assert_close(actual[tile], features, rtol=1e-4, atol=1e-2)
+
+
+def test_losses_are_measured_on_the_fixed_background(tiny_weights: BackboneWeights) -> None:
+    """Losses before and after are measured on the background of the settings, whatever the steps used."""
+    values: dict[str, Any] = {"background": (0.3, 0.2, 0.1), "warm_start": False}
+    drawn, fixed = (
+        make_over_background(tiny_weights, ball(), training_background=kind, **values)
+        for kind in ("palette", "background")
+    )
+    assert drawn.start() == fixed.start()
+    run(drawn)
+    assert mean_loss(drawn.evaluate([0, 1])) == mean_loss(fixed.evaluate([0, 1], drawn.sh_dc.detach()))
+
+
+# --- whole runs ----------------------------------------------------------------------------------------------------
+
+
+def test_paper_preset_uses_a_fixed_background_for_scans(tiny_weights: BackboneWeights) -> None:
+    settings = make_settings("paper", steps_coarse=1, steps_sos=1)
+    stylizer = Stylizer.planned(ball(), cameras(2), style(), settings, weights=tiny_weights)
+    assert (stylizer.job.plan.training_background, stylizer.job.plan.warm_start) == ("background", False)
+    assert torch.equal(stylizer.sh_dc, ball().sh_dc[stylizer.job.plan.seen])
+
+
+#: Layers of all terms.
+LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu3_2", "relu3_3", "relu4_1", "relu4_2", "relu5_1")
+
+
+def make_in_float16(weights: BackboneWeights, precision: PlannedPrecision, **values: Any) -> Stylizer:
+    """Make a job with a fixed plan, so that the precision does not depend on the processor."""
+    inputs = wall(40, 30), cameras(), Style.of(style())
+    settings = make_settings(**{"steps_coarse": 2, "steps_sos": 4, "coarsest_side": 24, "early_stop": False, **values})
+    plan = plan_job(JobInputs(*inputs, settings, weights=weights)).plan
+    return Stylizer(prepare_job(replace(plan, precision=precision), JobInputs(*inputs, settings, weights=weights)))
+
+
+@pytest.mark.parametrize(("style_loss", "weighted"), [("sos", True), ("mixed", False)])
+def test_loss_and_gradient_are_those_of_float64(
+    vgg16_weights: BackboneWeights, style_loss: Any, weighted: bool
+) -> None:
+    """Powers of two cancel in the loss and its gradient, with a content term and position weights too."""
+    image, other = (synthetic_image(48, 64, seed=seed).float() for seed in (1, 2))
+    coverage = torch.rand((48, 64), generator=torch.Generator().manual_seed(0)) if weighted else None
+    results = []
+    for dtype in (torch.float64, torch.float16, torch.bfloat16):
+        network = FeatureNetwork(vgg16_weights, dtype=dtype, layers=LAYERS)
+        loss = SosLoss(network, style_loss=style_loss, coarsest=24, content_weight=100.0)
+        target = loss.targets.of_view(other, coverage)
+        results.append(loss.evaluate(image, loss.targets.of_style(Style.of(style()), (48, 64)), target))
+    exact, half, _ = results
+    assert (half.values - exact.values).abs().max() < 2e-3 * exact.values.abs().max()
+    gradients = [each.image_gradient for each in results if each.image_gradient is not None]
+    errors = [Difference.of(each, gradients[0]).relative_error for each in gradients[1:]]
+    assert errors[0] < 0.6 * errors[1]
+
+
+def test_overflowing_step_is_repeated_in_bfloat16(tiny_weights: BackboneWeights) -> None:
+    """A content weight of 1e12 makes gradients too large for float16."""
+    half, expected = (make_in_float16(tiny_weights, name, content_weight=1e12) for name in ("float16", "bfloat16"))
+    for _ in range(3):
+        assert half.run_step().terms == expected.run_step().terms
+    assert half.job.plan.precision == half.job.network.precision == "bfloat16"
+    assert torch.equal(half.sh_dc, expected.sh_dc)
+    line = half.job.plan.decisions[-1]
+    assert (line.item, line.decision) == ("precision", "features in bfloat16 from step 1 on")
+
+
+def test_steps_follow_those_of_float32(tiny_weights: BackboneWeights) -> None:
+    half, exact = (make_in_float16(tiny_weights, name) for name in ("float16", "float32"))
+    for _ in range(half.job.total_steps):
+        assert half.run_step().loss == pytest.approx(exact.run_step().loss, rel=0.1)
+    assert half.job.network.dtype == torch.float16
+    assert torch.isfinite(half.sh_dc).all()

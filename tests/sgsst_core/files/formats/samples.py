@@ -1,7 +1,5 @@
 """Sample files of compressed formats and streamed SOGs, and checks of their readers."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json

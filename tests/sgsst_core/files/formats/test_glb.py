@@ -1,7 +1,5 @@
 """Tests of GLB: values computed by hand, transformations of nodes, integers, and false files."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Tests of variants of PLY and of compressed PLYs."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Tests of what holds for every scene format."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -228,6 +226,16 @@ def test_random_damage_never_crashes_a_reader(tmp_path: Path, format: SceneForma
     check_damage(tmp_path / "scene", encoded(tmp_path, format))
 
 
-@pytest.mark.parametrize("data", [b"hello", b"\x89PNG\r\n\x1a\n" + bytes(300), b"a text of words. " * 200, bytes(3200)])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"hello",
+        b"\x89PNG\r\n\x1a\n" + bytes(300),
+        b"a text of words. " * 200,
+        bytes(3200),
+        b"so it is\nv 1 2 3\n" * 100,  # no OBJ
+        b"# only\n# comments\n" * 100,
+    ],
+)
 def test_other_files_are_refused(tmp_path: Path, data: bytes) -> None:
     refused(tmp_path, data, re.escape(f"expected {TITLES}"))

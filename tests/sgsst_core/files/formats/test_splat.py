@@ -1,7 +1,5 @@
 """Tests of .splat and .ksplat files."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of SPZ, against gsply, values computed by hand and false headers."""
 
-from __future__ import annotations
-
 import gzip
 import struct
 import zlib
