@@ -1,9 +1,6 @@
 """Actions of users of the page, and of clients beside it, for the page's tests."""
 
-from __future__ import annotations
-
 import base64
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +10,7 @@ import httpx2
 
 from tests.api.page.browser import Watched
 from tests.api.service import Service, wait_for
+from tests.api.service import submit as submit_job
 
 Visit = Callable[..., Watched]
 STEPS: dict[str, Any] = {"steps_coarse": 5, "steps_sos": 30, "backbone": "vgg16", "early_stop": False, "measure": 0}
@@ -23,11 +21,8 @@ REFUSED = "the server responded with a status of 422"
 
 def submit(service: Service, files: dict[str, Path], key: str | None = None, **parameters: Any) -> str:
     """Submit a job through the API instead of the page, and return its id."""
-    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     with service.client(key) as client:
-        answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(STEPS | parameters)})
-    assert answer.status_code == 202, answer.text
-    return str(answer.json()["id"])
+        return submit_job(client, files, **STEPS | parameters)
 
 
 def done(service: Service, job_id: str) -> str:

@@ -1,7 +1,5 @@
 """Browser for tests of the web page: Chromium, driven by Playwright, with software WebGL."""
 
-from __future__ import annotations
-
 import base64
 import io
 import os

@@ -1,7 +1,5 @@
 """Tests of blends on the page: comparison with `sgsst render`, sliders, triangle, the held key, and saving."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,6 @@
-"""Tests of `sgsst view`: one HTML file that shows a scene in a browser, opened from disk."""
+"""Tests of `sgsst view` and `sgsst study`: HTML files that show scenes in a browser, opened from disk."""
 
-from __future__ import annotations
-
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,11 @@ import torch
 from api.cli.main import main
 from sgsst_core.constants import SH_C0
 from sgsst_core.files.scene_file import write_scene
+from sgsst_core.quality.study import count_votes
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from tests.api.page.browser import Watched, in_frame, psnr, rendered
-from tests.small_scenes import cameras, wall, write_files
+from tests.small_scenes import ball, cameras, wall, write_files
 
 
 def painted(red: float, green: float, blue: float, *, harmonics: float = 0.0) -> Scene:
@@ -51,17 +51,6 @@ def test_exported_page_wipes_between_both_colors(tmp_path: Path, browser: Any) -
     style.fill("0")
     page.wipe("Home")
     assert page.pixels().max(axis=(0, 1)) == pytest.approx(blue, abs=3)
-    page.check()
-    page.context.close()
-
-
-@pytest.mark.slow
-def test_exported_page_of_one_scene(tmp_path: Path, browser: Any) -> None:
-    assert export(tmp_path, painted(0.1, 0.9, 0.1, harmonics=0.01), None) == 0
-    page = Watched(browser, (tmp_path / "page.html").as_uri())
-    page.page.goto(page.url)
-    assert page.pixels().max(axis=(0, 1))[1] > 200
-    assert not page.page.get_by_label("Wipe", exact=True).is_visible()
     page.check()
     page.context.close()
 
@@ -144,3 +133,32 @@ def test_page_must_be_an_html_file(tmp_path: Path, capsys: pytest.CaptureFixture
     write_scene(tmp_path / "stylized.ply", wall())
     assert main(["view", str(tmp_path / "stylized.ply"), "--out", str(tmp_path / "page.ply")]) == 2
     assert "not the name of an HTML file" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_votes_by_arrow_keys_are_saved_and_counted(
+    browser: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, cameras, style = write_files(tmp_path, ball())
+    page, key = tmp_path / "study.html", tmp_path / "study.key.json"
+    variants = [f"{name}={scene}" for name in ("warm-start", "cold-start", "third-way")]
+    assert main(["study", "make", *variants, "--cameras", str(cameras), "--style", str(style), "--out", str(page)]) == 0
+    watched = Watched(browser, page.as_uri())
+    watched.page.goto(page.as_uri())
+    known = json.loads(key.read_text())
+    for _ in known["views"]:
+        watched.page.keyboard.press("ArrowDown")
+    watched.page.keyboard.press("Backspace")
+    watched.page.keyboard.press("ArrowLeft")
+    assert watched.page.get_by_role("status").inner_text().startswith("All views are done")
+    with watched.page.expect_download() as download:
+        watched.page.get_by_role("button", name="Save votes").click()
+    votes = tmp_path / "votes.json"
+    download.value.save_as(votes)
+    assert watched.wrong == []
+    shares = count_votes(key, [votes])
+    assert sum(share.votes for share in shares) == shares[0].total == len(known["views"])
+    capsys.readouterr()
+    assert main(["study", "count", str(key), str(votes)]) == 0
+    assert f"{len(known['views'])} votes" in capsys.readouterr().out
+    watched.context.close()

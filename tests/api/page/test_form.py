@@ -1,9 +1,8 @@
-"""Tests of the form for a new job: its layout, files, inputs and refusals."""
-
-from __future__ import annotations
+"""Tests of the form for a new job: its layout, files, inputs and refusals, and jobs that start from another one."""
 
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,23 @@ import httpx2
 import pytest
 from PIL import Image
 
-from tests.api.page.actions import REFUSED, Visit, choose, drop, expand, set_options, write_selection
-from tests.api.page.browser import FLAGS, Watched, chromium
+from sgsst_core.settings import STRENGTHS
+from tests.api.page.actions import (
+    LONG,
+    REFUSED,
+    STEPS,
+    Visit,
+    choose,
+    done,
+    drop,
+    expand,
+    set_options,
+    started,
+    submit,
+    write_selection,
+)
+from tests.api.page.browser import Watched
+from tests.api.page.test_viewer import base_of
 from tests.api.service import Service, wait_for
 
 pytestmark = pytest.mark.slow
@@ -75,38 +89,19 @@ def test_dropped_files_that_are_not_used_are_named(visit: Visit, files: dict[str
     watched.check()
 
 
-def test_truncated_scene_is_refused_on_its_card(visit: Visit, files: dict[str, Path]) -> None:
-    watched = visit()
-    page = watched.page
-    whole = files["scene"].read_bytes()
-    files["scene"].write_bytes(whole[:-5000])
-    choose(watched, files)
-    slot = page.locator(".slot", has_text="Scene")
-    slot.get_by_text(f"616 Gaussians take {len(whole):,} bytes, but it has {len(whole) - 5000:,}.").wait_for()
-    page.get_by_text("3 cameras").or_(page.locator(".thumb", has_text="cameras.json")).first.wait_for()
-    sent: list[str] = []
-    page.on("request", lambda request: sent.append(request.url) if "/v1/" in request.url else None)
-    page.get_by_role("button", name="Start").click()
-    assert page.get_by_label("Scene", exact=True).evaluate("(input) => input === document.activeElement")
-    assert sent == []
-    files["scene"].write_bytes(whole)
-    choose(watched, {"scene": files["scene"]})
-    slot.get_by_text("616 Gaussians · SH degree 1").wait_for()
-    assert slot.locator(".wrong").is_hidden()
-    watched.check()
-
-
 def test_unusable_files_are_named_on_their_cards(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
     """At once, and they stop the start. A reload says which files of this device to choose again."""
     image = io.BytesIO()
     Image.open(files["style"]).convert("RGB").save(image, "JPEG")
     contents = {"empty.ply": b"", "photo.ply": image.getvalue(), "half.jpg": image.getvalue()[:800]}
+    contents["half.ply"] = files["scene"].read_bytes()[:-5000]
     for name, content in (contents | {"notes.txt": b"text", "cut.json": files["cameras"].read_bytes()[:-20]}).items():
         (tmp_path / name).write_bytes(content)
     watched = visit()
     page = watched.page
     for role, name, text in (
         ("Scene", "empty.ply", "empty.ply is empty (0 bytes)"),
+        ("Scene", "half.ply", "616 Gaussians take"),
         ("Scene", "photo.ply", "Not a scene file"),
         ("Style", "half.jpg", "half.jpg is incomplete or damaged"),
         ("Photos", "half.jpg", "half.jpg is incomplete or damaged"),
@@ -207,21 +202,6 @@ def test_defaults_are_those_of_the_chosen_preset(visit: Visit) -> None:
     watched.check()
 
 
-def test_form_works_without_webgl(browser: Any, service: Service, files: dict[str, Path]) -> None:
-    """Without WebGL the place of the 3D view is small, and files can be chosen and dropped."""
-    flags = [flag for flag in FLAGS if "swiftshader" not in flag] + ["--disable-3d-apis"]
-    bare = browser.browser_type.launch(executable_path=chromium(), args=flags, chromium_sandbox=False)
-    watched = Watched(bare, service.url, width=1100, height=800)
-    page = watched.page
-    page.goto(service.url)
-    page.get_by_text("needs WebGL 2").wait_for()
-    assert page.locator(".stage").bounding_box()["height"] < 450
-    drop(watched, files)
-    page.get_by_role("button", name="Remove scene.ply").wait_for()
-    watched.check("WebGL")
-    bare.close()
-
-
 def test_estimate_warns_and_can_be_stopped(visit: Visit, files: dict[str, Path]) -> None:
     watched = visit()
     page = watched.page
@@ -263,4 +243,194 @@ def test_ten_minutes_are_offered_for_a_long_job(visit: Visit, files: dict[str, P
     assert asked.value.post_data_json["parameters"]["within"] == 600
     page.get_by_role("region", name="Estimate").wait_for()
     assert page.locator("[data-name=within] input").input_value() == "10"  # minutes
+    watched.check()
+
+
+@pytest.fixture
+def night(tmp_path: Path) -> Path:
+    path = tmp_path / "night.png"
+    Image.new("RGB", (64, 48), (20, 30, 120)).save(path)
+    return path
+
+
+def uploads_of(watched: Watched) -> list[str]:
+    """Return a list to which the page's new uploads are added."""
+    uploads: list[str] = []
+    watched.page.on(
+        "request",
+        lambda request: (
+            uploads.append(request.url) if (request.method, request.url[-11:]) == ("POST", "/v1/uploads") else None
+        ),
+    )
+    return uploads
+
+
+def digests(job: dict[str, Any], role: str) -> list[str]:
+    return [each["sha256"] for each in job["inputs"] if each["role"] == role]
+
+
+def test_another_painting_and_changes_send_nothing_again(
+    visit: Visit, service: Service, files: dict[str, Path], night: Path
+) -> None:
+    regions = [{"name": "top", "select": "half-space=0,1,0,0", "freeze": True}]
+    values: dict[str, Any] = {
+        "preset": "preview",
+        "steps_coarse": 3,
+        "background": "40,40,48",
+        "regions": regions,
+        "name": "mine",
+    }
+    before = httpx2.get(f"{service.url}/v1/jobs/{done(service, submit(service, files, **values))}").json()
+    watched = visit(f"/#/jobs/{before['id']}")
+    page, sent = watched.page, uploads_of(watched)
+    page.get_by_role("button", name="Try another painting").click()
+    page.get_by_role("button", name="Remove scene.ply").wait_for()
+    page.get_by_text("3 cameras shown in the scene").wait_for()
+    watched.settled()
+    slot = page.locator(".slot", has_text="One painting")
+    assert slot.locator(".thumb").count() == 0
+    slot.locator("input").set_input_files(night)
+    other = started(watched, service)
+    assert len(sent) == 1, "only the painting is sent"
+    assert other["name"] == "scene · night"
+    for role in ("scene", "cameras"):
+        assert digests(other, role) == digests(before, role)
+    assert digests(other, "style") != digests(before, "style")
+    unchanged = {name: value for name, value in before["parameters"].items() if name not in ("name", "background")}
+    assert {name: other["parameters"][name] for name in unchanged} == unchanged
+    assert other["parameters"]["background"] == pytest.approx([40 / 255, 40 / 255, 48 / 255])
+
+    page.goto(f"{service.url}/#/jobs/{before['id']}")
+    page.get_by_role("button", name="Same with changes").click()
+    page.get_by_role("img", name="style.png").wait_for()
+    set_options(watched, steps_coarse=2)
+    again = started(watched, service)
+    assert len(sent) == 1, "nothing is sent"
+    assert digests(again, "style") == digests(before, "style")
+    assert (again["parameters"]["steps_coarse"], before["parameters"]["steps_coarse"]) == (2, 3)
+    watched.check()
+
+
+def test_painting_of_a_region_is_not_one_of_the_job(
+    visit: Visit, service: Service, files: dict[str, Path], night: Path, tmp_path: Path
+) -> None:
+    """It is no part of the blend or of the default name, and another painting replaces only that of the job."""
+    region = {"name": "the left", "select": "half-space=1,0,0,0", "style": ["night.png:1.0"], "content_weight": "light"}
+    body = [(role, (path.name, path.read_bytes())) for role, path in [*files.items(), ("style", night)]]
+    values = STEPS | {"steps_sos": 2, "regions": [region]}
+    answer = httpx2.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(values)}, timeout=60)
+    before = httpx2.get(f"{service.url}/v1/jobs/{done(service, answer.json()['id'])}").json()
+    assert before["name"] == "scene · style"
+    watched = visit(f"/#/jobs/{before['id']}")
+    page = watched.page
+    labels = "async ([base, job]) => (await import(`${base}/names.js`)).labels([job])"
+    assert page.evaluate(labels, [base_of(watched), before]) == ["style; the left: night"]
+    page.get_by_role("button", name="Try another painting").click()
+    page.get_by_role("img", name="night.png").wait_for()
+    page.locator(".thumb", has_text="for the left").wait_for()
+    row = page.get_by_role("group", name="Region 1")
+    assert row.get_by_label("Strength").input_value() == "light"
+    page.get_by_role("button", name="Start", exact=True).click()
+    page.locator(".slot", has_text="Style").get_by_text("Choose a painting for the rest of the scene.").wait_for()
+    page.get_by_label("Style", exact=True).first.set_input_files(files["style"])
+    assert page.get_by_text("Blend them").is_hidden()
+    assert page.locator("[data-name=name] input").get_attribute("placeholder") == "scene · style"
+    row.get_by_label("Style").select_option("Same as the job")
+    page.get_by_text("Blend them").wait_for()
+    assert page.get_by_label("night.png", exact=True).input_value() == "1"
+    row.get_by_label("Style").select_option("night.png")
+    page.get_by_text("Blend them").wait_for(state="hidden")
+    again = started(watched, service)
+    assert again["name"] == "scene · style"
+    assert [each["style"] for each in again["parameters"]["regions"]] == ["night.png"]
+    assert digests(again, "style") == [digests(before, "style")[1], digests(before, "style")[0]]
+    httpx2.post(f"{service.url}/v1/jobs/{again['id']}/cancel").raise_for_status()
+    watched.check()
+
+
+def test_input_that_is_gone_is_asked_for_at_its_field(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    job_id = done(service, submit(service, files, steps_sos=1))
+    watched = visit(f"/#/jobs/{job_id}")
+    page = watched.page
+    page.get_by_role("button", name="Same with changes").click()
+    page.get_by_role("img", name="style.png").wait_for()
+    watched.settled()
+    httpx2.delete(f"{service.url}/v1/jobs/{job_id}").raise_for_status()
+    page.get_by_role("button", name="Start", exact=True).click()
+    slot = page.locator(".slot").first
+    slot.get_by_text("Upload the file again.").wait_for()
+    assert "No longer on the service: scene.ply. Choose it again." in slot.inner_text()
+    assert page.get_by_label("Scene", exact=True).get_attribute("aria-invalid") == "true"
+    watched.check(REFUSED, "404")
+
+
+def test_each_painting_can_be_a_job_of_its_own(
+    visit: Visit, service: Service, files: dict[str, Path], night: Path
+) -> None:
+    watched = visit(width=900, height=700)
+    page, sent = watched.page, uploads_of(watched)
+    choose(watched, files)
+    choose(watched, {"style": night})
+    set_options(watched, **(STEPS | {"steps_sos": 3}))
+    page.get_by_label("One job each").check()
+    assert page.get_by_label("night.png", exact=True).is_hidden(), "jobs of one painting blend nothing"
+    page.get_by_role("button", name="Start 2 jobs").click()
+    page.wait_for_url(re.compile("#/compare/job_[0-9a-f]+/job_[0-9a-f]+$"))
+    assert len(sent) == 4, "the scene is sent once for both"
+    ids = page.url.split("/")[-2:]
+    for job_id, name in zip(ids, ("scene · style", "scene · night"), strict=True):
+        job = httpx2.get(f"{service.url}/v1/jobs/{done(service, job_id)}").json()
+        assert (job["name"], len(digests(job, "style"))) == (name, 1)
+    page.get_by_label("Wipe", exact=True).wait_for()
+    tiles = page.get_by_role("list", name="Jobs side by side").get_by_role("listitem")
+    assert tiles.count() == 2
+    watched.settled()
+    for tile, name in zip(tiles.all(), ("style", "night"), strict=True):
+        tile.locator("img[src$='thumbnail.jpg']").wait_for()
+        assert name in tile.inner_text()
+    sides = page.get_by_label("Left", exact=True).locator("option").all_inner_texts()
+    assert sides[:3] == ["Original", "style", "night"]
+    watched.check()
+
+
+def test_job_is_finished_early_on_the_page(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    job_id = submit(service, files, **LONG)
+    watched = visit(f"/#/jobs/{job_id}")
+    page = watched.page
+    page.get_by_text("Adding detail · step").wait_for()
+    page.get_by_role("button", name="Stop here and keep it").click()
+    page.locator(".badge", has_text="Done").wait_for()
+    page.get_by_role("link", name="Download", exact=True).wait_for()
+    assert httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["result"]["stopped"] == "on-request"
+    watched.check()
+
+
+def test_paintings_are_chosen_from_the_gallery(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """Paintings of earlier jobs are not sent again."""
+    earlier = submit(service, files, **LONG, name="earlier")
+    httpx2.post(f"{service.url}/v1/jobs/{earlier}/cancel").raise_for_status()
+    watched = visit(width=900, height=700)
+    page, sent = watched.page, uploads_of(watched)
+    choose(watched, {role: files[role] for role in ("scene", "cameras")})
+    page.locator("summary", has_text="Gallery").click()
+    page.get_by_role("button", name="Add style.png").click()
+    page.get_by_role("button", name="Remove style.png").wait_for()
+    page.get_by_role("button", name="Add The Great Wave off Kanagawa, Hokusai").click()
+    page.get_by_role("button", name="Remove great_wave.jpg").wait_for()
+    broken = "(images) => images.filter((image) => image.complete && !image.naturalWidth).length"
+    assert page.locator(".painting img").count() > 6, "those of earlier jobs, and six of the page"
+    assert page.locator(".painting img").evaluate_all(broken) == 0
+    page.get_by_label("style.png", exact=True).fill("3")
+    set_options(watched, **STEPS)
+    page.get_by_role("radio", name="Balanced").check(force=True)
+    assert page.locator("[data-name=content_weight] input[list]").input_value() == "balanced"
+    page.locator("[data-name=content_weight] input[list]").fill("2.5")
+    assert page.locator(".strengths input:checked").count() == 0
+    page.get_by_role("radio", name="Light").check(force=True)
+    job = started(watched, service)
+    assert len(sent) == 3, "the scene, its cameras and the painting of the page"
+    assert job["parameters"]["content_weight"] == STRENGTHS["light"]
+    assert job["parameters"]["style_weights"] == [3.0, 1.0]
+    assert job["name"] == "scene · style + great_wave"
+    httpx2.post(f"{service.url}/v1/jobs/{job['id']}/cancel").raise_for_status()
     watched.check()

@@ -1,7 +1,5 @@
 """Tests of the web page from a user's perspective, in a real browser with a real service."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys
@@ -18,12 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.formats.sog import SOG
-from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.scene_file import write_scene
 from sgsst_core.scene.camera import resized
 from tests.api.page.actions import (
     LONG,
-    REFUSED,
     STEPS,
     Visit,
     choose,
@@ -32,7 +28,6 @@ from tests.api.page.actions import (
     expand,
     set_options,
     submit,
-    write_selection,
 )
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
@@ -202,27 +197,6 @@ def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str,
     watched.check("net::ERR", "Failed to load resource")
 
 
-def test_refusals_stand_beside_their_field(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
-    watched = visit()
-    page = watched.page
-    set_options(watched, steps_sos=10)
-    page.get_by_role("button", name="Start").click()
-    page.locator(".slot", has_text="Scene").get_by_text("Choose a scene.").wait_for()
-    image_path = tmp_path / "style.png"
-    image_path.write_bytes(b"this is no picture")
-    choose(watched, files | {"style": image_path})
-    page.get_by_role("button", name="Estimate time").click()
-    page.locator(".slot", has_text="Style").get_by_text("not an image").wait_for()
-    page.get_by_role("button", name="Remove style.png").click()
-    page.get_by_label("Style", exact=True).set_input_files(files["style"])
-    set_options(watched, resolution=-5)
-    page.get_by_role("button", name="Estimate time").click()
-    field = page.locator("[data-name=resolution]")
-    field.get_by_text("Must be at least 1.").wait_for()
-    assert field.locator("input").get_attribute("aria-invalid") == "true"
-    watched.check(REFUSED)
-
-
 def test_names_of_files_are_text(visit: Visit, service: Service, tmp_path: Path) -> None:
     """File names are shown as text everywhere: before upload, in the list, in the job's view and on the wipe."""
     hostile = "<img src=x onerror=document.title='broken'>"
@@ -283,23 +257,6 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     watched.check()
 
 
-def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """Geometry comes from the compressed file, colors from the result, in the order of the file."""
-    packed = files["scene"].with_name("scene.sog")
-    write_scene(packed, read_scene(files["scene"]).scene, SOG)
-    job_id = done(service, submit(service, files | {"scene": packed}, name="packed"))
-    result = files["scene"].with_name("stylized.ply")
-    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
-    watched = visit(f"/#/jobs/{job_id}", width=600, height=500)
-    watched.page.get_by_label("Camera", exact=True).select_option("1")
-    camera = resized(read_cameras(files["cameras"])[1], 384)
-    for key, path in (("End", packed), ("Home", result)):
-        wanted = rendered(path, camera)
-        watched.wipe(key)
-        assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered image
-    watched.check()
-
-
 def test_keyboard_alone(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     """Open a finished job from the list and use its view, without a pointer."""
     job_id = done(service, submit(service, files, name="by keyboard"))
@@ -335,8 +292,7 @@ def reach(page: Any, there: Callable[[], bool]) -> None:
 VIEWS = {"new": "/#/", "jobs": "/#/jobs", "missing": "/#/nowhere"}
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [360, 1100])
+@pytest.mark.parametrize(("scheme", "width"), [("light", 360), ("dark", 1100)])
 def test_accessible_and_never_too_wide(
     visit: Visit, service: Service, files: dict[str, Path], scheme: str, width: int
 ) -> None:
@@ -414,39 +370,6 @@ def _new_key(service: Service, name: str) -> str:
     command = [sys.executable, "-m", "api.cli", "keys", "create", name]
     process = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
     return process.stdout.split()[-1]
-
-
-def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
-    """The job has the settings that the page has sent: a weighted mix of two styles, and one frozen half."""
-    night = tmp_path / "night.png"
-    Image.new("RGB", (64, 64), (20, 30, 90)).save(night)
-    watched = visit()
-    page = watched.page
-    choose(watched, {role: path for role, path in files.items() if role != "style"})
-    page.get_by_label("Style", exact=True).set_input_files([files["style"], night])
-    page.get_by_label("style.png", exact=True).fill("3")
-    set_options(watched, **STEPS, name="two styles")
-    page.locator("details.fold", has_text="Regions").evaluate("(fold) => { fold.open = true; }")
-    page.get_by_role("button", name="Add a region").click()
-    region = page.get_by_role("group", name="Region 1")
-    region.get_by_label("Name").fill("left")
-    write_selection(region, "half-space=1,0,0,0")
-    region.get_by_label("Freeze").check()
-    page.get_by_role("button", name="Start").click()
-    page.locator(".badge", has_text="Done").wait_for()
-    job_id = page.url.rsplit("/", 1)[1]
-    parameters = httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["parameters"]
-    assert parameters["style_weights"] == [3.0, 1.0]
-    (own_region,) = parameters["regions"]
-    assert (own_region["name"], own_region["select"], own_region["freeze"]) == ("left", "half-space=1,0,0,0", True)
-    result = tmp_path / "stylized.ply"
-    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
-    before, after = read_scene(files["scene"]).scene, read_scene(result).scene
-    moved = (before.sh_dc != after.sh_dc).any(dim=1)
-    side = before.means[:, 0] > 0
-    assert moved[side].float().mean() in (0, 1)
-    assert moved[~side].float().mean() == 1 - moved[side].float().mean()
-    watched.check()
 
 
 def test_fingers_turn_and_pinch(browser: Any, service: Service, tmp_path: Path) -> None:

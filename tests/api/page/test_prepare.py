@@ -1,7 +1,5 @@
 """Tests of what precedes a job in a browser: the example, and scenes and paintings that are turned and cropped."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,6 +1,4 @@
-"""Tests of finished jobs on the page: downloads, thumbnails, other tabs, and browsers without WebGL."""
-
-from __future__ import annotations
+"""Tests of jobs on the page: live colors, downloads, thumbnails, other tabs, and browsers without WebGL."""
 
 import re
 from pathlib import Path
@@ -11,10 +9,13 @@ import httpx2
 import numpy as np
 import pytest
 
+from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import RESULT_FORMATS, read_scene_header
-from tests.api.page.actions import LONG, STEPS, Visit, done, submit
-from tests.api.page.browser import FLAGS, Watched, chromium
-from tests.api.service import Service
+from sgsst_core.scene.camera import resized
+from tests.api.page.actions import LONG, STEPS, Visit, done, drop, submit
+from tests.api.page.browser import FLAGS, Watched, chromium, psnr, rendered
+from tests.api.page.test_page import frame_of
+from tests.api.service import Service, wait_for
 from tests.small_scenes import cameras, wall, write_files
 
 pytestmark = pytest.mark.slow
@@ -213,7 +214,9 @@ def test_another_tab_sees_changes(visit: Visit, service: Service, files: dict[st
         watched.check()
 
 
-def test_result_without_webgl_is_the_sheet(browser: Any, service: Service, finished: str) -> None:
+def test_page_without_webgl_has_the_sheet_and_the_form(
+    browser: Any, service: Service, files: dict[str, Path], finished: str
+) -> None:
     flags = [flag for flag in FLAGS if "swiftshader" not in flag] + ["--disable-3d-apis"]
     bare = browser.browser_type.launch(executable_path=chromium(), args=flags, chromium_sandbox=False)
     watched = Watched(bare, service.url, width=1100, height=800)
@@ -228,6 +231,10 @@ def test_result_without_webgl_is_the_sheet(browser: Any, service: Service, finis
     page.goto(f"{service.url}/#/compare/{finished}/{finished}")
     page.get_by_text("needs WebGL 2").wait_for()
     assert page.get_by_label("Left", exact=True).is_hidden()
+    page.goto(service.url)
+    page.get_by_text("needs WebGL 2").wait_for()
+    drop(watched, files)
+    page.get_by_role("button", name="Remove scene.ply").wait_for()
     watched.check("WebGL")
     bare.close()
 
@@ -274,3 +281,70 @@ def test_video_is_made_and_played(visit: Visit, service: Service, finished: str)
     page.get_by_label("Video of the result").wait_for()
     page.get_by_role("button", name="Make another video").wait_for()
     watched.check("net::ERR")
+
+
+def watch(visit: Visit, job_id: str) -> Watched:
+    """Open the page of a running job, and wait for its colors."""
+    watched = visit(f"/#/jobs/{job_id}", width=600, height=700)
+    watched.page.locator(".side.right", has_text="So far").wait_for(state="attached")
+    watched.page.get_by_label("Camera", exact=True).select_option("1")
+    return watched
+
+
+def finish(service: Service, job_id: str) -> None:
+    """Ask a running job to end with its present colors."""
+    httpx2.post(f"{service.url}/v1/jobs/{job_id}/finish").raise_for_status()
+
+
+def names(service: Service, job_id: str) -> set[str]:
+    listed = httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts").json()["artifacts"]
+    return {entry["name"] for entry in listed}
+
+
+def test_scene_is_shown_while_the_job_waits_and_its_colors_while_it_runs(
+    visit: Visit, service: Service, files: dict[str, Path]
+) -> None:
+    before, job_id = (submit(service, files, **LONG) for _ in range(2))
+    wanted = rendered(files["scene"], resized(read_cameras(files["cameras"])[1], 384))
+    waiting = visit(f"/#/jobs/{job_id}", width=600, height=700)
+    waiting.page.locator(".state", has_text="queue").wait_for()
+    waiting.page.get_by_label("Camera", exact=True).select_option("1")
+    assert psnr(frame_of(waiting, wanted), wanted) > 38  # the view is larger than the rendered image
+    assert waiting.page.get_by_label("Wipe", exact=True).is_hidden()
+    httpx2.post(f"{service.url}/v1/jobs/{before}/cancel").raise_for_status()
+    waiting.page.locator(".side.right", has_text="So far").wait_for()  # in the open tab
+    waiting.check()
+    watched = watch(visit, job_id)
+    page = watched.page
+    watched.wipe("End")
+    assert psnr(frame_of(watched, wanted), wanted) > 38
+    watched.wipe("Home")
+    first = watched.pixels()
+    wait_for(lambda: not np.array_equal(watched.pixels(), first), "other colors", service.said)
+    assert httpx2.head(f"{service.url}/v1/jobs/{job_id}/artifacts/live/colors.f16").headers["content-length"] == "3696"
+    assert page.get_by_label("Amount of style").is_hidden()
+    assert "live" not in page.locator(".files").inner_text()
+    page.get_by_label("Latest preview").check(force=True)
+    page.locator(".preview img").wait_for()
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".badge", has_text="Canceled").wait_for()
+    watched.check()
+
+
+def test_view_of_a_running_job_becomes_its_result(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    job_id = submit(service, files, **LONG)
+    watched = watch(visit, job_id)
+    page = watched.page
+    page.locator("canvas.view").evaluate("(canvas) => { canvas.id = 'same'; }")
+    page.get_by_label("Latest preview").check(force=True)
+    finish(service, job_id)
+    page.locator(".side.right", has_text="Stylized").wait_for()
+    assert page.locator("canvas.view").get_attribute("id") == "same"
+    page.get_by_label("Amount of style").wait_for()
+    result = files["scene"].with_name("result.ply")
+    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{done(service, job_id)}/artifacts/stylized.ply").content)
+    wanted = rendered(result, resized(read_cameras(files["cameras"])[1], 384))
+    watched.wipe("Home")
+    assert psnr(frame_of(watched, wanted), wanted) > 38
+    assert not any(name.startswith("live/") for name in names(service, job_id))
+    watched.check()

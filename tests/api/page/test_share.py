@@ -1,7 +1,5 @@
 """Tests of sharing a result: the link opens its viewer without a key, in frames of permitted sites too."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterator
