@@ -1,4 +1,4 @@
-"""Scales of a view with their weights, and the mean loss over scales and steps, which decides when a job stops.
+"""Scales of a view with their weights, and the loss over scales and steps: mean, end of a job, prediction.
 
 By default all weights are equal, so E = sum_s w_s E_transfer(s) / sum_s w_s is the mean over scales, as in the paper.
 Scales of weight 0 are not computed. Losses differ between views, so they are compared as geometric means over windows
@@ -8,8 +8,10 @@ of whole rounds; every round visits each view once. This module imports no PyTor
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 
@@ -100,6 +102,8 @@ EVEN = ScaleWeights()
 MIN_WINDOW = 24
 #: The loss has converged when it falls by less than this fraction from one window to the next.
 MIN_FALL = 0.005
+#: Maximum relative standard error of a prediction of the loss.
+MAX_ERROR = 0.1
 
 
 def window_length(round_length: int) -> int:
@@ -133,3 +137,49 @@ def has_converged(losses: Sequence[float], round_length: int) -> bool:
     if len(losses) < 2 * window:
         return False
     return smoothed(losses, window) > (1 - MIN_FALL) * smoothed(losses[-2 * window : -window], window)
+
+
+#: Step, view and loss of a step.
+Visit = tuple[int, int, float]
+
+
+def predicted_fall(visits: Sequence[Visit], factor: float, round_length: int) -> float | None:
+    """Predict the loss of the last round after `factor` times as many steps, relative to that of the last round so far.
+
+    The losses of view v after n steps are taken as c_v n^-b: a power law with a constant for each view, because losses
+    of views differ by factors. Its exponent is that of least squares on logarithms, in float64. Where the second half
+    of the steps falls significantly more slowly (by two standard errors), its exponent counts: the curve is flattening.
+
+    Args:
+        visits: Steps on all scales, in order.
+        factor: Number of all steps relative to those so far, at least 1.
+        round_length: Number of steps in which every view is visited once.
+
+    Returns:
+        Ratio in (0, 1]. None for less than two windows, or if its relative standard error exceeds `MAX_ERROR`.
+    """
+    if len(visits) < 2 * window_length(round_length):
+        return None
+    exponent, error = _power_law(visits)
+    later, later_error = _power_law(visits[len(visits) // 2 :])
+    if later + 2 * later_error < exponent:
+        exponent, error = later, later_error
+    steps = visits[-1][0]
+    longer = fmean(math.log((factor * steps - place) / (steps - place)) for place in range(round_length))
+    return math.exp(-max(exponent, 0.0) * longer) if error * longer <= MAX_ERROR else None
+
+
+def _power_law(visits: Sequence[Visit]) -> tuple[float, float]:
+    """Return the exponent b of losses c_v n^-b and its standard error; infinite if too few views were visited twice."""
+    views: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    for step, view, loss in visits:
+        views[view].append((math.log(step), math.log(max(loss, 1e-300))))
+    points = []
+    for own in views.values():
+        x, y = (fmean(column) for column in zip(*own, strict=True))
+        points += [(step - x, loss - y) for step, loss in own]
+    free, square = len(points) - len(views) - 1, math.fsum(x * x for x, _ in points)
+    if free < 1:
+        return 0.0, math.inf
+    slope = math.fsum(x * y for x, y in points) / square
+    return -slope, math.sqrt(math.fsum((y - slope * x) ** 2 for x, y in points) / free / square)

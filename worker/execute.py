@@ -202,7 +202,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
         report_error=str(error) if error else None,
         compressed=compressed and compressed.text("the PLY"),
         loss_views=len(stylizer.job.evaluation_views),
-        loss_over_time=loss_over_time(stylizer, before),
+        loss_over_time=loss_over_time(stylizer, before, stopped),
     )
 
 

@@ -167,6 +167,8 @@ def _print_result(outputs: Outputs, result: Result, command: str) -> None:
     print_field("loss measured", f"before on {result.loss_views} views, after in the steps of the last round of views")
     for line in _loss_over_time(result):
         print_field("loss over time", line)
+    if result.loss_over_time and (more := result.loss_over_time["more_time"]):
+        print_field("more time", more["text"])
     paths = [("stylized scene", outputs.ply)]
     if outputs.compressed is not None and result.compressed is not None:
         print_field("compressed", result.compressed)

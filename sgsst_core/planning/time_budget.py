@@ -31,8 +31,8 @@ _COARSE = 0.5
 _RASTER_PASSES = 2.0
 #: Fraction of the time of a pass of the rasterizer that is in proportion to the pixels; the rest is for the Gaussians.
 _OF_PIXELS = 0.5
-#: Factor of the longer budget whose choice is shown.
-_MORE = 4
+#: Factor of the longer time whose gain is shown.
+LONGER = 4
 #: Factor by which a choice may exceed the budget: the pace of the job then leaves out steps, but adds none.
 _OPTIMISM = 1.15
 #: Time from the last step to the last file written: constant seconds for images and report, and seconds per Gaussian
@@ -79,7 +79,7 @@ class TimeChoice:
         views: Indices of the chosen views.
         steps_coarse, steps_sos: Steps of both phases.
         seconds: Predicted seconds of the steps and everything after the choice.
-        longer_resolution, longer_steps: Longer side of the views and steps of a budget that is `_MORE` times as long.
+        longer_resolution, longer_steps: Longer side of the views and steps of a budget that is `LONGER` times as long.
         all_steps: Steps of phase 2 without a budget.
         most_steps: Maximum steps of phase 2 if the pace of the job decides their number; None if it does not.
     """
@@ -118,7 +118,7 @@ class TimeChoice:
             reason += ", as chosen before"
         gains = [f"{self.longer_resolution} px"] if self.longer_resolution > self.resolution else []
         gains += [f"{self.longer_steps} steps"] if self.longer_steps > steps else []
-        more = f"; in {duration(_MORE * within, ' ')}: {', '.join(gains)}" if within and gains else ""
+        more = f"; in {duration(LONGER * within, ' ')}: {', '.join(gains)}" if within and gains else ""
         taken = f"{steps} step{'s' if steps != 1 else ''}"
         return Decision("time budget", f"{self.resolution} px, {views}, {taken}", reason + more)
 
@@ -139,7 +139,7 @@ def choose(cameras: Sequence[Camera], settings: Settings, pace: Pace, left: floa
         gaussians: Number of Gaussians.
     """
     estimate = _Estimate(cameras, settings, pace, ending_seconds(gaussians))
-    longer = estimate.best(left + (_MORE - 1) * (settings.within or 0.0))
+    longer = estimate.best(left + (LONGER - 1) * (settings.within or 0.0))
     steps = longer.steps_sos + longer.steps_coarse * estimate.has_two_phases(longer.resolution)
     falls = settings.learning_rate_end != settings.learning_rate and "learning_rate_end" in settings.fixed
     most = None if falls or "steps_sos" in settings.fixed else settings.steps_sos

@@ -16,8 +16,10 @@ from sgsst_core import container
 from sgsst_core.budget import device_peak, peak_memory
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel.collectives import TRAFFIC
+from sgsst_core.planning.time_budget import LONGER
+from sgsst_core.progress import duration, percent
 from sgsst_core.quality.findings import Finding
-from sgsst_core.scales import ScaleWeights, ratio, smoothed
+from sgsst_core.scales import ScaleWeights, predicted_fall, ratio, smoothed
 from sgsst_core.stylizing.checkpoint import versions
 from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.loop import Stopped
@@ -108,7 +110,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
                 str(scale): ratio(after[scale].total, before[scale].total) for scale in before if scale in after
             },
         },
-        "loss_over_time": loss_over_time(stylizer, before),
+        "loss_over_time": loss_over_time(stylizer, before, stopped),
         "measuring": _measuring_json(stylizer),
         "novel_views": _novel_views_json(stylizer.measured),
         "approximations": {"what": stylizer.measured[0]["approximated"], "moments": errors} if errors else None,
@@ -270,19 +272,21 @@ def sent_json(history: Sequence[StepRecord]) -> dict[str, dict[str, int]] | None
     return medians or None
 
 
+#: Reasons to stop after which more time might pay, and minimum factor of steps for which the loss is predicted.
+_MORE_MIGHT_PAY, _MIN_FACTOR = ("finished", "within"), 1.5
 #: Relative losses for which the report states the time of reaching them.
 _REACHED = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 
 
-def loss_over_time(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | None:
+def loss_over_time(stylizer: Stylizer, before: Evaluation, stopped: Stopped) -> dict[str, Any] | None:
     """Summarize how the loss fell over time.
 
     The loss is the mean over the last round of views, relative to the unstylized scene.
 
     Returns:
         `relative`: Final loss. `reached`: Seconds and step at which the loss first fell to 0.5, 0.2, 0.1 and so on.
-        `last_tenth`: Loss before and after the last tenth of the time. None if no step used all scales, or if
-            the initial loss is 0.
+        `last_tenth`: Loss before and after the last tenth of the time. `more_time`: See `_more_time`. None if no step
+            used all scales, or if the initial loss is 0.
     """
     records = [record for record in stylizer.history if record.stage == "sos"]
     start, losses = mean_loss(before, stylizer.job.loss.weights), [record.loss for record in records]
@@ -299,7 +303,40 @@ def loss_over_time(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | N
     border = 0.9 * stylizer.seconds
     earlier = [value for record, value in zip(records, relative, strict=True) if record.seconds <= border]
     last = {"seconds": stylizer.seconds - border, "from": earlier[-1], "to": relative[-1]} if earlier else None
-    return {"relative": relative[-1], "reached": reached, "last_tenth": last}
+    more = _more_time(stylizer, records, relative[-1]) if stopped in _MORE_MIGHT_PAY else None
+    return {"relative": relative[-1], "reached": reached, "last_tenth": last, "more_time": more}
+
+
+def _more_time(stylizer: Stylizer, records: Sequence[StepRecord], relative: float) -> dict[str, Any] | None:
+    """Predict what `LONGER` times the time would leave of the loss, on the same views.
+
+    Of a time budget, all that is added goes into steps, as far as the job has any left.
+
+    Args:
+        records: Steps on all scales.
+        relative: Loss that is left.
+
+    Returns:
+        `steps` in that time, `relative` loss after them, and both losses as a sentence (`text`). None if the time would
+            go into larger views instead, or nothing can be predicted (`predicted_fall`).
+    """
+    job, factor, longer = stylizer.job, float(LONGER), f"{LONGER} times the time"
+    within, choice = job.settings.within, job.plan.time_choice
+    if within is not None:
+        if stylizer.seconds > within:  # a resumed job, which has had more than one budget
+            return None
+        every = job.plan.steps_coarse + (choice.all_steps if choice else job.settings.steps_sos)
+        factor = min(1 + (LONGER - 1) * within / stylizer.seconds, every / stylizer.step)
+        longer = f"{duration(LONGER * within)} instead of {duration(within)}"
+    visits = [(record.step, record.view, record.loss) for record in records]
+    fall = predicted_fall(visits, factor, job.round_length) if factor >= _MIN_FACTOR else None
+    if fall is None:
+        return None
+    rest = fall * relative
+    text = (
+        f"{longer} would lower the rest of the loss on these views from {percent(relative)} to about {percent(rest)}."
+    )
+    return {"steps": round(factor * stylizer.step), "relative": rest, "text": text}
 
 
 def _novel_views_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:

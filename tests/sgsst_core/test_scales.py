@@ -1,6 +1,7 @@
 """Tests of scales: their weights in the loss, the scales that are drawn, and windows of rounds of views."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.planning.facts import check_scales
 from sgsst_core.quality.measure import Float32Reference, Measurements
-from sgsst_core.scales import ScaleWeights, has_converged, has_reached
+from sgsst_core.scales import ScaleWeights, Visit, has_converged, has_reached, predicted_fall, smoothed
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
@@ -99,6 +100,68 @@ def test_convergence_ignores_differences_between_views() -> None:
     assert not has_converged(falling, 3)
     assert has_converged([views[step % 3] for step in range(60)], 3)
     assert not has_converged([views[step % 3] for step in range(47)], 3)  # less than two windows of 24
+
+
+def visits(steps: int, curve: Callable[[int], float], noise: float = 0.0) -> list[Visit]:
+    """Return steps on `VIEWS` views, round by round in random order, whose losses differ by factors of up to e^5."""
+    generator = torch.Generator().manual_seed(2)
+    order = [view for _ in range(steps) for view in torch.randperm(VIEWS, generator=generator).tolist()][:steps]
+    noises = (noise * torch.randn(steps, generator=generator).double()).exp().tolist()
+    return [
+        (step, view, math.exp(view) * curve(step) * random)
+        for step, (view, random) in enumerate(zip(order, noises, strict=True), start=1)
+    ]
+
+
+def actual_fall(steps: int, curve: Callable[[int], float], factor: int) -> float:
+    """Return the loss of the last round after `factor` times the steps, relative to that after the steps."""
+    ends = [visits(each, curve) for each in (steps, factor * steps)]
+    before, after = (smoothed([loss for _, _, loss in each], VIEWS) for each in ends)
+    return after / before
+
+
+VIEWS = 6
+
+
+@pytest.mark.parametrize(
+    ("steps", "curve", "noise", "within"),
+    [
+        (48, lambda step: 3 * step**-0.4, 0.0, 1e-9),
+        (120, lambda step: step**-0.25, 0.0, 1e-9),
+        (120, lambda step: step**-0.3, 0.2, 0.1),
+        (120, lambda step: 0.2 + 1 / step, 0.0, 0.05),
+        (120, lambda step: max(0.2, step**-0.5), 0.01, 0.05),
+    ],
+    ids=["short power law", "power law", "noise", "flattening", "plateau"],
+)
+def test_fall_is_predicted_from_the_curve(
+    steps: int, curve: Callable[[int], float], noise: float, within: float
+) -> None:
+    predicted = predicted_fall(visits(steps, curve, noise), 4, VIEWS)
+    assert predicted == pytest.approx(actual_fall(steps, curve, 4), rel=within)
+
+
+def test_exponent_is_that_of_least_squares() -> None:
+    """The reference solves for the exponent and the constants of all views at once."""
+    noisy = visits(60, lambda step: step**-0.3, 0.1)
+    design = torch.zeros(60, VIEWS + 1, dtype=torch.float64)
+    for row, (step, view, _) in zip(design, noisy, strict=True):
+        row[view], row[VIEWS] = 1.0, math.log(step)
+    logs = torch.tensor([[math.log(loss)] for _, _, loss in noisy], dtype=torch.float64)
+    exponent = float(torch.linalg.lstsq(design, logs).solution[VIEWS])
+    longer = sum(math.log((240 - place) / (60 - place)) for place in range(VIEWS)) / VIEWS
+    assert predicted_fall(noisy, 4, VIEWS) == pytest.approx(math.exp(exponent * longer), rel=1e-9)
+
+
+def test_nothing_is_predicted_from_few_steps_or_noise() -> None:
+    assert predicted_fall(visits(47, lambda step: step**-0.4), 4, VIEWS) is None, "less than two windows of 24"
+    assert predicted_fall(visits(48, lambda step: step**-0.4, 1.0), 4, VIEWS) is None
+    assert predicted_fall([(step, step, 1.0) for step in range(1, 60)], 4, 2) is None, "no view is visited twice"
+
+
+def test_loss_that_does_not_fall_stays() -> None:
+    assert predicted_fall(visits(60, lambda step: step**0.2), 4, VIEWS) == 1
+    assert predicted_fall([(step, 0, 0.0) for step in range(1, 60)], 4, 1) == 1
 
 
 def test_target_is_reached_only_after_a_whole_round() -> None:

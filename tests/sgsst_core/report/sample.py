@@ -73,6 +73,7 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
             "relative": 0.0987,
             "reached": [{"relative": 0.5, "seconds": 1.5, "step": 7}, {"relative": 0.25, "seconds": 2.5, "step": 9}],
             "last_tenth": {"seconds": 0.4, "from": 0.101, "to": 0.0987},
+            "more_time": {"steps": 72, "relative": 0.08, "text": "4 times the time would pay."},
         },
         "findings": [
             {

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,14 @@ from PIL import Image
 from api.cli.console import loss_text
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.terms import LossTerms
+from sgsst_core.progress import percent
 from sgsst_core.report.charts import history_of, running_mean
 from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, loss_over_time
 from sgsst_core.report.images import write_contact_sheet
 from sgsst_core.report.page import render_page
+from sgsst_core.scales import smoothed
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.loop import Stopped, run
 from sgsst_core.stylizing.steps import Evaluation, StepRecord, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import ball, blind_camera, cameras, style
@@ -124,7 +127,7 @@ def test_loss_over_time_is_reported(finished: tuple[Stylizer, Evaluation, Evalua
     ]
     stylizer.seconds, stylizer.job.views.covered = 70.0, [0, 1]
     try:
-        summary = loss_over_time(stylizer, {0: LossTerms(gram=8.0)})
+        summary = loss_over_time(stylizer, {0: LossTerms(gram=8.0)}, "converged")
     finally:
         stylizer.history, stylizer.seconds, stylizer.job.views.covered = history, seconds, covered
     assert summary is not None
@@ -135,6 +138,47 @@ def test_loss_over_time_is_reported(finished: tuple[Stylizer, Evaluation, Evalua
         "from": pytest.approx(0.06),
         "to": summary["relative"],
     }
+    assert summary["more_time"] is None
+
+
+@pytest.mark.parametrize(
+    ("stopped", "within", "seconds", "expected"),
+    [
+        ("finished", None, 70.0, "4 times the time would lower the rest of the loss on these views from 13 %"),
+        ("within", 100.0, 75.0, "6 min 40 s instead of 1 min 40 s would lower the rest of the loss on these views"),
+        ("within", 100.0, 150.0, None),
+        ("converged", None, 70.0, None),
+    ],
+    ids=["steps", "time budget", "resumed", "early stop"],
+)
+def test_report_says_whether_more_time_would_pay(
+    finished: tuple[Stylizer, Evaluation, Evaluation],
+    monkeypatch: pytest.MonkeyPatch,
+    stopped: Stopped,
+    within: float | None,
+    seconds: float,
+    expected: str | None,
+) -> None:
+    """The loss falls with the square root of the steps. The budget has 60 of 240 steps."""
+    stylizer = finished[0]
+    losses = {step: 8.0 * step**-0.5 for step in range(1, 61)}
+    history = [
+        StepRecord(step, "sos", step % 5, 1.0, loss, {0: LossTerms(gram=loss)}, {}, 0) for step, loss in losses.items()
+    ]
+    settings = stylizer.job.settings.model_copy(update={"within": within, "steps_sos": 240})
+    for name, value in {"history": history, "seconds": seconds, "step": 60}.items():
+        monkeypatch.setattr(stylizer, name, value)
+    monkeypatch.setattr(stylizer, "job", replace(stylizer.job, settings=settings))
+    summary = loss_over_time(stylizer, {0: LossTerms(gram=8.0)}, stopped)
+    assert summary is not None
+    more = summary["more_time"]
+    if expected is None:
+        assert more is None
+        return
+    assert more["text"].replace("\u00a0", " ").startswith(expected)
+    assert more["text"].endswith(f"to about {percent(more['relative'])}.")
+    assert more["steps"] == 240
+    assert more["relative"] == pytest.approx(smoothed([step**-0.5 for step in range(236, 241)], 5))
 
 
 def test_initial_loss_of_zero_has_no_ratio(finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources) -> None:

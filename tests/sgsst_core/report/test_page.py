@@ -241,6 +241,13 @@ def test_time_is_divided_in_percent_with_a_remainder() -> None:
     assert "everything else 20.0 % 0.72 s" in page.text
 
 
+def test_page_says_whether_more_time_would_pay() -> None:
+    report = sample_report()
+    assert "4 times the time would pay." in parsed_without_figures(report).text
+    report["loss_over_time"]["more_time"] = None
+    assert "4 times the time" not in parsed_without_figures(report).text
+
+
 def test_judgment_of_the_result_is_shown_next_to_the_start() -> None:
     report = sample_report()
     page = parsed_without_figures(report)
