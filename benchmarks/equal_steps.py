@@ -103,7 +103,7 @@ def main() -> None:
     description |= {"resolution": arguments.resolution, "steps": [arguments.steps_coarse, arguments.steps_sos]}
     description |= {"settings": json.loads(arguments.settings)}
     description |= {"region": arguments.region} if region else {}
-    judge, exact = _judge(scene, cameras, style, base)
+    judge, exact = judge_and_loss(scene, cameras, style, base)
     wanted = quantiles(style, torch.ones(style.shape[:2]))
     rows = {name: json.loads(text or "{}") for name, _, text in (row.partition("=") for row in arguments.rows)}
     paces: dict[tuple[str, int], Pace] = {}
@@ -180,7 +180,7 @@ class JudgedRegion:
         return distance / pixels
 
 
-def _judge(
+def judge_and_loss(
     scene: Scene, cameras: list[Camera], style: Tensor, settings: dict[str, Any]
 ) -> tuple[Judge, Float32Reference]:
     """Return a judge of the novel views between a job's views, and the exact loss of its views."""

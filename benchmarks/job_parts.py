@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("options", nargs="*", help="of `sgsst stylize`, after --")
     arguments = parse(parser)
     scene = read_scene(arguments.scene).scene
-    starts = {name: median(_seconds([name]) for _ in range(arguments.rounds)) for name in STARTS}
+    starts = {name: median(command_seconds([name]) for _ in range(arguments.rounds)) for name in STARTS}
     jobs = {}
     with tempfile.TemporaryDirectory() as folder:
         ply, out = Path(folder, "scene.ply"), Path(folder, "out.ply")
@@ -56,7 +56,8 @@ def main() -> None:
     write_result("job_parts", figures, presets=["standard"], scenes={arguments.scene.parent.name: arguments.scene})
 
 
-def _seconds(command: list[str]) -> float:
+def command_seconds(command: list[str]) -> float:
+    """Run an `sgsst` command in a process of its own, and return its seconds."""
     started = time.perf_counter()
     subprocess.run([*SGSST, *command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=True)
     return time.perf_counter() - started
@@ -66,7 +67,7 @@ def _job(command: list[str], report: Path, rounds: int) -> dict[str, float]:
     """Return the median seconds of a job by part, largest first, with those of the whole command."""
     runs = []
     for _ in range(rounds):
-        seconds = _seconds(command)
+        seconds = command_seconds(command)
         parts = json.loads(report.read_text("utf-8"))["seconds_by_part"]
         runs.append({"command": seconds, **parts, "unnamed": seconds - sum(parts.values())})
     medians = {name: median(run.get(name, 0.0) for run in runs) for name in runs[0]}
