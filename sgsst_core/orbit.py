@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy  # imports its modules at first use
 import torch
-from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from sgsst_core.constants import NEAR
@@ -165,11 +164,11 @@ def _pieces(points: Tensor, weights: Tensor) -> Tensor:
     flat = ((cell[:, 0] * cells + cell[:, 1]) * cells + cell[:, 2]).numpy()
     held = np.bincount(flat, weights.numpy(), cells**3)
     touching = np.ones((3, 3, 3), dtype=bool)
-    labels, _ = ndimage.label((held > _MIN_CELL * held.sum()).reshape(cells, cells, cells), touching)
+    labels, _ = scipy.ndimage.label((held > _MIN_CELL * held.sum()).reshape(cells, cells, cells), touching)
     by_piece = np.bincount(labels.ravel(), held)
     large = by_piece >= _MIN_PIECE * held.sum()
     large[0] = False  # the empty and light cells
-    near = ndimage.binary_dilation(large[labels], touching)  # includes the faint fringe around
+    near = scipy.ndimage.binary_dilation(large[labels], touching)  # includes the faint fringe around
     return torch.from_numpy(near.ravel()[flat])
 
 
@@ -400,7 +399,7 @@ def _balance(subject: Subject, up: Tensor) -> float:
     if not _area(base) > 0:
         return -1.0 if area > 0 else 0.0
     center = (subject.weights[:, None] * flat).sum(0).numpy()
-    edges = ConvexHull(base.numpy()).equations
+    edges = scipy.spatial.ConvexHull(base.numpy()).equations
     return -float((edges[:, :2] @ center + edges[:, 2]).max()) / math.sqrt(area)
 
 
@@ -418,8 +417,8 @@ def _area(points: Tensor) -> float:
     if len(points) < 3:
         return 0.0
     try:
-        return float(ConvexHull(points.numpy()).volume)  # in two dimensions, `volume` is the area
-    except QhullError:
+        return float(scipy.spatial.ConvexHull(points.numpy()).volume)  # in two dimensions, `volume` is the area
+    except scipy.spatial.QhullError:
         return 0.0
 
 

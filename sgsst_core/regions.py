@@ -26,10 +26,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import scipy  # imports its modules at first use
 import torch
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sgsst_core.errors import MaskError, SettingsError
@@ -287,7 +287,7 @@ def decide_by_votes(means: Tensor, inside: Tensor, total: Tensor) -> Tensor:
         return result
     places = means.double().numpy()
     count = min(NEIGHBORS, int(decided.sum()))
-    _, nearest = cKDTree(places[decided]).query(places[open_], k=count, workers=torch.get_num_threads())
+    _, nearest = scipy.spatial.cKDTree(places[decided]).query(places[open_], k=count, workers=torch.get_num_threads())
     votes = result[decided][torch.as_tensor(nearest).reshape(-1, count)].double().mean(dim=1)
     result[open_] = torch.where(votes == 0.5, result[open_], votes > 0.5)
     return result

@@ -256,11 +256,11 @@ class Processes:
         return self._lanes[kind].full
 
     async def warm(self) -> None:
-        """Start a process that checks jobs in advance: its imports take seconds."""
-        process = self._take(1)
-        self._idle.append(process)
-        with contextlib.suppress(OSError):  # the next request starts it, or tells why it cannot
-            await process.start()
+        """Start processes that check and plan jobs in advance: their imports take seconds."""
+        for threads in {1, self._threads["plan"]}:
+            self._idle.append(process := self._take(threads))
+            with contextlib.suppress(OSError):  # the next request starts it, or tells why it cannot
+                await process.start()
 
     async def close(self) -> None:
         """Stop all processes, which also aborts any work in progress."""

@@ -29,6 +29,7 @@ from typing import Any, NoReturn
 
 import psutil
 import torch
+from scipy import ndimage, spatial  # noqa: F401  # before the first fork, for orbits
 
 from service import problems
 from service.inputs import ROLES, JobParameters, Staged, WorkRequest, job_spec
@@ -66,8 +67,8 @@ with contextlib.suppress(ImportError):
     import av  # noqa: F401  # before the first fork, so that every child has it
 
 load_registries()  # before the first fork too
-#: Time at which all modules were imported.
-_ready_at = time.time()
+#: Seconds from the start of this process to its first request, nearly all of them for imports.
+_START_SECONDS = time.time() - process_start()
 #: Maximum size of a response in bytes.
 MAX_ANSWER = 64 << 20
 #: Maximum number of progress messages of one child that are passed on. The calling process keeps them until its client
@@ -174,17 +175,17 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
             **findings,
             "plan": inputs.plan,
             "estimated_seconds": inputs.seconds,
-            "total_seconds": _seconds_to_start() + time.perf_counter() - started + inputs.seconds,
+            "total_seconds": _START_SECONDS + time.perf_counter() - started + inputs.seconds,
             "warnings": warnings_of(inputs.decisions),
             "memory_bytes": inputs.peak_bytes,
         }
     to_write = request.output and request.output_file
-    left = seconds_left(settings.within, time.time() - _seconds_to_start() - (time.perf_counter() - started))
+    left = seconds_left(settings.within, time.time() - _START_SECONDS - (time.perf_counter() - started))
     job = dry_run(spec, inputs, lambda now: _show(now, send), to_write, left)
     if chosen := job.plan.time_choice:
         inputs = inputs.chosen(chosen, chosen.applied(settings))
     # The job starts a process with the same modules as this one, then reads and plans as was done here.
-    expected, before = estimate(job), _seconds_to_start() + time.perf_counter() - started
+    expected, before = estimate(job), _START_SECONDS + time.perf_counter() - started
     return {
         **findings,
         "views": len(inputs.cameras),
@@ -196,12 +197,6 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
         "memory_bytes": job.plan.peak_bytes,
         "device_memory_bytes": job.plan.device_bytes,
     }
-
-
-@functools.cache
-def _seconds_to_start() -> float:
-    """Return the seconds from the start of this process to its first request, nearly all of them for imports."""
-    return _ready_at - process_start()
 
 
 def _show(now: Progress, send: _Send) -> None:
@@ -557,7 +552,6 @@ def _is_response(answer: Any) -> bool:
 
 def main() -> None:
     """Process requests until stdin is closed."""
-    _seconds_to_start()  # cached before any fork
     torch.set_num_threads(1)  # a child forked from a process with threads could wait for them forever
     die_with_parent()
     for line in sys.stdin.buffer:

@@ -120,6 +120,9 @@ def with_scales(weights: BackboneWeights, scales: Mapping[str, float]) -> Backbo
     before = 1.0
     for layer, (weight, bias) in weights.convolutions.items():
         factor = scales.get(layer.replace("conv", "relu"), before)
-        convolutions[layer] = (weight.double() * (factor / before)).float(), (bias.double() * factor).float()
+        convolutions[layer] = (
+            weight if factor == before else (weight.double() * (factor / before)).float(),
+            (bias.double() * factor).float(),
+        )
         before = factor
     return replace(weights, convolutions=convolutions, scales=dict(scales))

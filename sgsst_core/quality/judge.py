@@ -27,10 +27,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import ClassVar
 
+import scipy  # imports its modules at first use
 import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file
-from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
@@ -373,7 +373,7 @@ def ssim(first: Tensor, second: Tensor) -> Tensor:
     x, y = (luminance(image.double()).cpu().numpy() for image in (first, second))
     deviation, radius = _SSIM_WINDOW
     mean_x, mean_y, xx, yy, xy = (
-        gaussian_filter(values, deviation, truncate=radius) for values in (x, y, x * x, y * y, x * y)
+        scipy.ndimage.gaussian_filter(values, deviation, truncate=radius) for values in (x, y, x * x, y * y, x * y)
     )
     a, b = _SSIM_CONSTANTS
     of_means = (2 * mean_x * mean_y + a) / (mean_x**2 + mean_y**2 + a)

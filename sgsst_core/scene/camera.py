@@ -16,9 +16,9 @@ from statistics import mode
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
+import scipy  # imports its modules at first use
 import torch
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from sgsst_core.constants import FRUSTUM_MARGIN
@@ -278,7 +278,9 @@ def between(first: Camera, second: Camera) -> Camera:
     Shoemake 1985). If they differ by 180 degrees, it is halfway along either of the two shortest rotations.
     """
     ends = np.stack([camera.world_to_camera[:3, :3].double().numpy() for camera in (first, second)])
-    rotation = torch.from_numpy(Slerp([0, 1], Rotation.from_matrix(ends))(0.5).as_matrix())
+    rotation = torch.from_numpy(
+        scipy.spatial.transform.Slerp([0, 1], scipy.spatial.transform.Rotation.from_matrix(ends))(0.5).as_matrix()
+    )
     world_to_camera = torch.eye(4, dtype=torch.float64)
     world_to_camera[:3, :3] = rotation
     world_to_camera[:3, 3] = -rotation @ ((first.center + second.center) / 2)
@@ -490,7 +492,9 @@ class CameraPath:
 
             centers = _centers(self.cameras)
             self._positions = CubicHermiteSpline(self.knots, centers, catmull_rom_tangents(self.knots, centers))
-            self._rotations = Slerp(self.knots, Rotation.from_matrix(_rotations(self.cameras)))
+            self._rotations = scipy.spatial.transform.Slerp(
+                self.knots, scipy.spatial.transform.Rotation.from_matrix(_rotations(self.cameras))
+            )
 
     def evenly(self, count: int) -> list[Camera]:
         """Return `count` cameras from the first to the last, at even steps of the path parameter."""
@@ -606,7 +610,7 @@ def _changes(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     centers = _centers(cameras)
     distances = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     moves = distances[moved(distances, centers)]
-    rotations = Rotation.from_matrix(_rotations(cameras))
+    rotations = scipy.spatial.transform.Rotation.from_matrix(_rotations(cameras))
     angles = (rotations[:-1].inv() * rotations[1:]).magnitude() if len(cameras) > 1 else np.zeros(0)
     zooms = np.abs(np.diff([_relative_intrinsics(camera)[:2] for camera in cameras], axis=0)).max(axis=1, initial=0.0)
     relative = distances / np.median(moves) if len(moves) else np.zeros_like(distances)

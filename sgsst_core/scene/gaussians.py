@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import scipy  # imports its modules at first use
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sgsst_core.constants import SH_DEGREES
@@ -207,7 +207,9 @@ def rotations(quats: Tensor) -> Tensor:
     """Return the rotation matrices [P, 3, 3] of wxyz quaternions [P, 4]; the identity for a zero quaternion."""
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     nonzero = torch.where((quats != 0).any(1, keepdim=True), quats, identity)
-    matrices: Tensor = torch.from_numpy(Rotation.from_quat(nonzero.roll(-1, 1).numpy()).as_matrix())
+    matrices: Tensor = torch.from_numpy(
+        scipy.spatial.transform.Rotation.from_quat(nonzero.roll(-1, 1).numpy()).as_matrix()
+    )
     return matrices
 
 

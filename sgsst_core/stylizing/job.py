@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
+import scipy  # imports its modules at first use
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from sgsst_core.budget import Cache, forget_device_peak, memory_for
@@ -258,7 +258,7 @@ def rotated(style: Tensor, degrees: float) -> Tensor:
     if not rest:
         return style
     height, width = style.shape[:2]
-    spun = ndimage.rotate(style.double().numpy(), rest, axes=(1, 0), reshape=True, order=3, mode="nearest")
+    spun = scipy.ndimage.rotate(style.double().numpy(), rest, axes=(1, 0), reshape=True, order=3, mode="nearest")
     inner_height, inner_width = _inside(height, width, math.radians(rest))
     top, left = (spun.shape[0] - inner_height) // 2, (spun.shape[1] - inner_width) // 2
     cropped = spun[top : top + inner_height, left : left + inner_width]

@@ -14,9 +14,9 @@ from typing import Any, Self
 
 import numpy as np
 import psutil
+import scipy  # imports its modules at first use
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.optim.adam import adam
 
@@ -273,7 +273,7 @@ def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     if bool(seen.all()):
         return torch.zeros((0, 3))
     count = min(NEIGHBORS, int(seen.sum()))
-    tree = cKDTree(means[seen].double().numpy())
+    tree = scipy.spatial.cKDTree(means[seen].double().numpy())
     weights, change, positions = weights[seen], change[seen], means[~seen].double()
     votes = torch.empty((len(positions), 3))
     # Ordered by the cells of a coarse grid: consecutive searches then read the same part of the tree.
