@@ -12,13 +12,14 @@ from benchmarks.stability import image_cases as images
 from benchmarks.stability import job_cases as jobs
 from benchmarks.stability import optimization_cases as optimization
 from benchmarks.stability import precision_cases as precision
+from benchmarks.stability import search as search
 from benchmarks.stability import view_cases as views
 from benchmarks.stability.case import Case, CaseResult, Group, Measurement, measure
 
 __all__ = ["Case", "CaseResult", "Group", "Measurement", "all_cases", "measure"]
 
 
-_GROUPS = (gaussians, views, images, optimization, precision, jobs, formats)
+_GROUPS = (gaussians, views, images, optimization, precision, jobs, search, formats)
 
 
 def all_cases() -> list[Case]:

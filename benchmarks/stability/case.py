@@ -7,26 +7,33 @@ import resource
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import cache
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import sos_reference
 from sgsst_core.constants import NEAR
-from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.features.layers import winograd_pays_off
+from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeights, load_network_weights
 from sgsst_core.features.vgg import Activations, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.facts import DTYPES
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.settings import PlannedPrecision, Settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.job import JobInputs
+from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.stylizer import Stylizer
 
 Group = Literal[
     "Gaussians", "views", "style and content", "stiff optimization", "precision", "jobs", "files and orbits"
@@ -41,6 +48,88 @@ CLOSE_TO_CUTOFF = 2e-5
 LARGEST_STEP = 1e-2
 #: Relative error bound of float32 loss and gradient against float64, with the same ReLU and max-pool decisions.
 LOSS_BOUND = 1e-5
+#: Safety factor for the gradient's change due to rounded features. The change in float32 is up to 8 times as large,
+#: because float32 also rounds sums, and rounds sums of equal numbers the same way each time.
+SAFETY = 8.0
+#: Upper limit of a gradient's allowed error, regardless of rounding errors: its direction remains about right.
+MOST_UNCERTAIN = 0.5
+
+
+@dataclass(frozen=True)
+class Way:
+    """Way to evaluate a loss or to run a job, in which a case is measured.
+
+    Attributes:
+        name: Name, as in tables.
+        precision: Precision of the feature network. On a CPU without matrix units, 16 bits are emulated.
+        bits: Significant bits of features that are rounded slightly more than in this precision.
+        channels: Channels of each layer of random networks.
+        settings: Settings of jobs, which override those of a case.
+        ranks: Number of ranks of jobs.
+    """
+
+    name: str
+    precision: PlannedPrecision = "float32"
+    bits: int = 20
+    channels: int = 8
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    ranks: int = 1
+
+    @property
+    def in_16_bits(self) -> bool:
+        """Whether features have 16 bits."""
+        return DTYPES[self.precision] != torch.float32
+
+    def network(self, weights: BackboneWeights) -> FeatureNetwork:
+        """Return a feature network in this precision."""
+        return FeatureNetwork(weights, dtype=DTYPES[self.precision], winograd=self.precision == "winograd")
+
+    def suits(self, height: int, width: int) -> bool:
+        """Return whether an image is computed in this way: Winograd's algorithm leaves small ones to float32."""
+        return self.precision != "winograd" or winograd_pays_off(height, width)
+
+
+FLOAT32 = Way("float32")
+BFLOAT16 = Way("bfloat16", "bfloat16", bits=7)
+#: Ways to evaluate a loss. Winograd's algorithm, which needs 64 channels, rounds up to four times as far as float32;
+#: the same bounds are wide enough. Formats of 16 bits have one significant bit more than stated, because not only
+#: features are rounded to them, but weights and gradients too.
+PRECISIONS = (
+    FLOAT32,
+    Way("Winograd", "winograd", bits=18, channels=64),
+    BFLOAT16,
+    Way("float16", "float16", bits=10),
+)
+
+
+def in_ways(
+    name: str,
+    group: Group,
+    measure: str,
+    run: Callable[[Way, bool], CaseResult],
+    ways: Sequence[Way] = PRECISIONS,
+) -> list[Case]:
+    """Return a case for each way."""
+    return [Case(name, group, measure, partial(run, way), way.name) for way in ways]
+
+
+def planned(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor,
+    settings: Settings,
+    weights: BackboneWeights,
+    way: Way = FLOAT32,
+    collectives: Collectives = ALONE,
+) -> Stylizer:
+    """Create the stylizer of a job in a precision, even if the plan would refuse it on this machine."""
+    own = settings.model_copy(update={"precision": "float32"})
+    first = Stylizer.planned(scene, cameras, style, own, weights=weights, collectives=collectives)
+    if way.precision == "float32":
+        return first
+    plan = replace(first.job.plan, precision=way.precision)
+    inputs = JobInputs(scene, cameras, Style.given(style), own, weights)
+    return Stylizer(plan_job(inputs, plan=plan, collectives=collectives))
 
 
 @dataclass(frozen=True)
@@ -73,12 +162,14 @@ class Case:
         measure: Description of the measured error.
         run: Function that runs the measurement: at full size if its argument is true, else in a version that takes a
             few seconds.
+        way: Name of the way that it is measured in.
     """
 
     name: str
     group: Group
     measure: str
     run: Callable[[bool], CaseResult]
+    way: str = "float32"
 
 
 @dataclass(frozen=True)
@@ -91,9 +182,15 @@ class Measurement:
 
 
 def measure(case: Case, *, full: bool = False) -> Measurement:
-    """Run a case: at full size if `full` is true, else in a version that takes at most a few seconds."""
+    """Run a case: at full size if `full` is true, else in a version that takes at most a few seconds.
+
+    A case that raises an error is not passed, and leaves others to be measured.
+    """
     peak, started = _peak_memory(), time.perf_counter()
-    result = case.run(full)
+    try:
+        result = case.run(full)
+    except Exception as error:
+        result = CaseResult(math.inf, 0.0, f"{type(error).__name__}: {error}")
     return Measurement(result, time.perf_counter() - started, _peak_memory() - peak)
 
 
@@ -274,26 +371,64 @@ class DecisionsOf(FeatureNetwork):
         return own
 
 
+class RoundedNetwork(DecisionsOf):
+    """Float64 network whose features are rounded to some bits after every layer.
+
+    Images are rounded to float32 too, because the pixels of coarser scales are averages.
+    """
+
+    def __init__(self, weights: BackboneWeights, other: FeatureNetwork, bits: int) -> None:
+        super().__init__(weights, other)
+        #: Factor for rounding a number x of 53 bits, by adding and subtracting its product.
+        self._factor = 2.0 ** (53 - bits)
+
+    def forward(self, rgb: Tensor, *, cache: bool = True, until: str | None = None) -> Activations:
+        return super().forward(rgb.float(), cache=cache, until=until)
+
+    def _convolve(self, x: Tensor, step: Any) -> Tensor:
+        features = super()._convolve(x, step)
+        large = features * self._factor
+        return (features + large) - large
+
+
+def rounding_error(
+    exact: SosResult, evaluate: Callable[[FeatureNetwork], SosResult], network: FeatureNetwork, weights: Any, way: Way
+) -> tuple[float, float]:
+    """Return `SAFETY` times the relative changes of loss and gradient if all features are rounded as in a precision.
+
+    They are large if the style loss is a difference of nearly equal statistics, or if a standard deviation is hardly
+    larger than the rounding of the features.
+    """
+    _, rounded = RoundedNetwork(weights, network, way.bits).beside(evaluate)
+    loss = abs(rounded.loss - exact.loss) / max(abs(exact.loss), 1.0)
+    return SAFETY * loss, SAFETY * gradient_error(rounded, exact)
+
+
 def compare_losses(
     image: Tensor,
     style: Tensor,
     content: Tensor,
     *,
+    way: Way = FLOAT32,
     content_weight: float = 1.0,
     untiled: bool = True,
 ) -> CaseResult:
-    """Return the relative error of float32 loss and pixel gradient against float64, with equal ReLU and pool decisions.
+    """Return the relative error of loss and pixel gradient against float64, with equal ReLU and pool decisions.
+
+    In 16 bits, the bound is what rounding of features changes, however much that is. What overflows in float16 is
+    compared in bfloat16, in which jobs continue then.
 
     Args:
         image: Image [H, W, 3].
         style: Style image [H', W', 3], downscaled to the view as usual.
         content: Content image [H, W, 3].
+        way: Precision to compare.
         content_weight: Weight of the content term.
         untiled: Whether to compare the loss with the untiled autograd reference instead of the float64 `SosLoss`;
             requires at least 16 x 16 pixels.
     """
     style = resize_area(style, style_size((style.shape[0], style.shape[1]), (image.shape[0], image.shape[1])))
-    single = FeatureNetwork(vgg16())
+    single = way.network(vgg16())
     double = DecisionsOf(vgg16(), single)
 
     def evaluated(network: FeatureNetwork) -> SosResult:
@@ -304,13 +439,19 @@ def compare_losses(
     if untiled:
         loss, _ = sos_reference(vgg16(), image, style, content, content_weight=content_weight)
     # The floor of 1 is far below any visible loss. It only prevents a division by zero for a perfect match.
-    error = max(abs(actual.loss - loss) / max(abs(loss), 1.0), gradient_error(actual, expected))
-    return CaseResult(error, LOSS_BOUND, f"loss {actual.loss:.3g}, {double.flips} ReLU and pool decisions flipped")
+    off, turned = abs(actual.loss - loss) / max(abs(loss), 1.0), gradient_error(actual, expected)
+    if way.precision == "float16" and not math.isfinite(turned):
+        return compare_losses(image, style, content, way=BFLOAT16, content_weight=content_weight, untiled=untiled)
+    note = f"loss {actual.loss:.3g}, {double.flips} ReLU and pool decisions flipped"
+    bound = LOSS_BOUND
+    if way.in_16_bits:
+        bound = max(rounding_error(expected, evaluated, single, vgg16(), way))
+    return CaseResult(max(off, turned), bound, note)
 
 
 def evaluate(loss: SosLoss, image: Tensor, style: Style, content: Tensor, coverage: Tensor | None = None) -> SosResult:
     """Return loss and gradient of an image [H, W, 3], in the precision of the loss's network."""
-    dtype = loss.network.dtype
+    dtype = torch.promote_types(loss.network.dtype, torch.float32)
     targets = loss.targets.of_style(style.map(lambda own: own.to(dtype)), (image.shape[0], image.shape[1]))
     return loss.evaluate(image.to(dtype), targets, loss.targets.of_view(content.to(dtype), coverage))
 
@@ -323,6 +464,20 @@ def gradient_error(actual: SosResult, exact: SosResult) -> float:
         return math.inf
     error = float((actual.image_gradient.double() - exact.image_gradient).norm())
     return error / max(float(exact.image_gradient.norm()), 1e-3)
+
+
+@cache
+def small_network(channels: int = FLOAT32.channels) -> BackboneWeights:
+    """Return VGG16's layers with few channels each and fixed random weights (He et al. 2015)."""
+    generator = torch.Generator().manual_seed(8)
+    layers, before = {}, 3
+    for block, count in enumerate(BLOCKS["vgg16"], start=1):
+        for index in range(1, count + 1):
+            weight = torch.randn(channels, before, 3, 3, generator=generator) * math.sqrt(2 / (9 * before))
+            layers[f"conv{block}_{index}"] = weight, torch.randn(channels, generator=generator)
+            before = channels
+    scale, shift = torch.full((3,), 255.0), -torch.tensor(CAFFE_MEAN)
+    return BackboneWeights("vgg16", "random", "0" * 64, layers, scale, shift)
 
 
 def flat(red: float, green: float, blue: float, height: int, width: int) -> Tensor:

@@ -9,7 +9,17 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from benchmarks.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, flat, texture, vgg16
+from benchmarks.stability.case import (
+    LOSS_BOUND,
+    Case,
+    CaseResult,
+    Way,
+    compare_losses,
+    flat,
+    in_ways,
+    texture,
+    vgg16,
+)
 from benchmarks.stability.sos_reference import layer_statistics_reference, style_loss_reference
 from sgsst_core.features.statistics import layer_statistics
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
@@ -23,18 +33,16 @@ _HEIGHT, _WIDTH = 32, 40
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    entries = [
-        Case(f"style: {name}", "style and content", _LOSS, partial(_style, make)) for name, make in _IMAGES.items()
-    ]
-    entries += [
-        Case(f"view: {name}", "style and content", _LOSS, partial(_view, make)) for name, make in _IMAGES.items()
-    ]
+    compared: dict[str, Callable[[Way, bool], CaseResult]] = {
+        **{f"style: {name}": partial(_style, make) for name, make in _IMAGES.items()},
+        **{f"view: {name}": partial(_view, make) for name, make in _IMAGES.items()},
+        "style and view: the same constant": _equal_constants,
+        "view equal to its content and its style": _nothing_to_do,
+        "style: 8 x 8": partial(_small_style, 8),
+        "style: 1 x 1": partial(_small_style, 1),
+    }
     return [
-        *entries,
-        Case("style and view: the same constant", "style and content", _LOSS, _equal_constants),
-        Case("view equal to its content and its style", "style and content", _LOSS, _nothing_to_do),
-        Case("style: 8 x 8", "style and content", _LOSS, partial(_small_style, 8)),
-        Case("style: 1 x 1", "style and content", _LOSS, partial(_small_style, 1)),
+        *(case for name, run in compared.items() for case in in_ways(name, "style and content", _LOSS, run)),
         Case("style: 10000 x 50", "style and content", "targets, relative to float64", _long_style),
         *(
             Case(
@@ -73,26 +81,26 @@ _IMAGES: dict[str, Callable[[], Tensor]] = {
 }
 
 
-def _style(make: Callable[[], Tensor], full: bool) -> CaseResult:
-    return compare_losses(texture(_HEIGHT, _WIDTH, 1), make(), texture(_HEIGHT, _WIDTH, 3))
+def _style(make: Callable[[], Tensor], way: Way, full: bool) -> CaseResult:
+    return compare_losses(texture(_HEIGHT, _WIDTH, 1), make(), texture(_HEIGHT, _WIDTH, 3), way=way)
 
 
-def _view(make: Callable[[], Tensor], full: bool) -> CaseResult:
-    return compare_losses(make(), texture(_HEIGHT, _WIDTH, 2), texture(_HEIGHT, _WIDTH, 3))
+def _view(make: Callable[[], Tensor], way: Way, full: bool) -> CaseResult:
+    return compare_losses(make(), texture(_HEIGHT, _WIDTH, 2), texture(_HEIGHT, _WIDTH, 3), way=way)
 
 
-def _equal_constants(full: bool) -> CaseResult:
-    return compare_losses(*(_constant(0.4, 0.4, 0.4) for _ in range(3)))
+def _equal_constants(way: Way, full: bool) -> CaseResult:
+    return compare_losses(*(_constant(0.4, 0.4, 0.4) for _ in range(3)), way=way)
 
 
-def _nothing_to_do(full: bool) -> CaseResult:
-    return compare_losses(*(texture(_HEIGHT, _WIDTH, 1) for _ in range(3)))
+def _nothing_to_do(way: Way, full: bool) -> CaseResult:
+    return compare_losses(*(texture(_HEIGHT, _WIDTH, 1) for _ in range(3)), way=way)
 
 
-def _small_style(side: int, full: bool) -> CaseResult:
+def _small_style(side: int, way: Way, full: bool) -> CaseResult:
     """Check a style image smaller than the stride of the deepest layers, which the loss then skips."""
     result = compare_losses(
-        texture(_HEIGHT, _WIDTH, 1), texture(side, side, 2), texture(_HEIGHT, _WIDTH, 3), untiled=False
+        texture(_HEIGHT, _WIDTH, 1), texture(side, side, 2), texture(_HEIGHT, _WIDTH, 3), way=way, untiled=False
     )
     return CaseResult(result.error, result.bound, f"deepest layers have no features and are skipped; {result.note}")
 

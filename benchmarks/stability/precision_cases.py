@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import reduce
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from sgsst_core.features.statistics import LayerStatistics, layer_statistics, me
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.terms import LayerTarget, style_loss
-from sgsst_core.quality.measure import Difference
 from sgsst_core.style import Style
 
 #: Relative error bound of a loss that is computed in partition tiles, for any number of tiles.
@@ -29,12 +28,8 @@ _SUMS_BOUND = 2e-6
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    in_float32 = "pixel gradient, relative to float32"
     entries: list[tuple[str, str, Callable[[bool], CaseResult]]] = [
         ("Gram matrix of 17 million pixels", "Gram, mean, sigma, relative to float64", _long_sum),
-        ("float16 features", in_float32, partial(_in_16_bits, torch.float16, 1.0)),
-        ("bfloat16 features", in_float32, partial(_in_16_bits, torch.bfloat16, 1.0)),
-        ("bfloat16 features of values up to 100", in_float32, partial(_in_16_bits, torch.bfloat16, 100.0)),
         ("statistics of 1, 2, 7 and 64 tiles", "loss and feature gradient, relative", _statistics_of_tiles),
         ("statistics of tiles in any order", "loss and feature gradient, relative", _order_of_tiles),
         ("whole loss of 1, 2, 7 and 64 tiles", "loss, relative to float64", _tiles),
@@ -63,27 +58,6 @@ def _long_sum(full: bool) -> CaseResult:
     return CaseResult(
         error, 1e-6, f"{int(exact.count):,} positions; float32 added one after the other is off by {off:.1e}"
     )
-
-
-def _in_16_bits(dtype: torch.dtype, brightest: float, full: bool) -> CaseResult:
-    """Check gradients in bfloat16, which has 8 bits of precision, and in float16, which has 11 but ends at 65,504.
-
-    Values must not overflow (features reach 1e4; float16 scales them), and the gradient's direction must be roughly
-    right.
-    """
-    image, style, content = (brightest * texture(48, 64, seed) for seed in (1, 2, 3))
-    gradients = []
-    for each in (torch.float32, dtype):
-        loss = SosLoss(FeatureNetwork(vgg16(), dtype=each))
-        gradient = loss.evaluate(
-            image, loss.targets.of_style(Style.of(style), (48, 64)), loss.targets.of_view(content)
-        ).image_gradient
-        assert gradient is not None
-        gradients.append(gradient)
-    exact, actual = gradients
-    difference = Difference.of(actual, exact)
-    note = f"cosine {difference.cosine:.3f}; measured in every plan and report that uses it"
-    return CaseResult(difference.relative_error, 0.5, note)
 
 
 def _split(height: int, width: int, tiles: int) -> list[tuple[slice, slice]]:

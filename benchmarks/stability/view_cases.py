@@ -11,11 +11,14 @@ import psutil
 import torch
 
 from benchmarks.stability.case import (
+    PRECISIONS,
     Case,
     CaseResult,
+    Way,
     camera,
     compare_losses,
     compare_rasterizers,
+    in_ways,
     ordinary,
     repeated,
     texture,
@@ -37,7 +40,10 @@ def cases() -> list[Case]:
     """Return all cases of this group."""
     sizes = [(1, 1), (15, 17), (16, 16), (3, 200), (33, 47), (4096, 16)]
     entries = [Case(name, "views", _IMAGE, partial(_rendered, make)) for name, make in _VIEWS.items()]
-    entries += [Case(f"{w} x {h} pixels, stylized", "views", _LOSS, partial(_stylized_size, w, h)) for w, h in sizes]
+    for width, height in sizes:
+        suited = [way for way in PRECISIONS if way.suits(height, width)]
+        run = partial(_stylized_size, width, height)
+        entries += in_ways(f"{width} x {height} pixels, stylized", "views", _LOSS, run, suited)
     return [
         *entries,
         Case("cameras that see nothing", "views", "views that were not left out", _blind),
@@ -54,14 +60,14 @@ def _size(width: int, height: int) -> tuple[Scene, Camera]:
     return ordinary(200), camera(width, height, focal=max(width, height) / 2)
 
 
-def _stylized_size(width: int, height: int, full: bool) -> CaseResult:
+def _stylized_size(width: int, height: int, way: Way, full: bool) -> CaseResult:
     """Check the loss of a view of this size, without layers whose output is empty.
 
     Quick runs limit the width to 512 pixels.
     """
     width = width if full else min(width, 512)
     image, style, content = texture(height, width, 1), texture(40, 32, 2), texture(height, width, 3)
-    return compare_losses(image, style, content, untiled=min(width, height) >= 16)
+    return compare_losses(image, style, content, way=way, untiled=min(width, height) >= 16)
 
 
 def _field_of_view(degrees: float) -> tuple[Scene, Camera]:

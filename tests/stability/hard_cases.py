@@ -11,11 +11,21 @@ from benchmarks.stability import Case, measure
 
 #: Maximum growth of memory. Three jobs with VGG16 need 1.5 GB; an allocation error takes many gigabytes.
 LARGEST_GROWTH = 3 << 30
+#: Number of cases in other ways than float32 of which one is tested. It has no factor in common with their number.
+_OTHERS = 7
 
 
 def parameters(cases: Sequence[Case | str]) -> list[Any]:
-    """Return all cases as parameters of a test; five of six are for the slow tests."""
-    return [case if place % 6 == 0 else pytest.param(case, marks=pytest.mark.slow) for place, case in enumerate(cases)]
+    """Return cases as parameters of a test: all of float32, and some of other ways; `make stability` runs all.
+
+    Five of six are for the slow tests.
+    """
+    single = [case for case in cases if isinstance(case, str) or case.way == "float32"]
+    others = [case for case in cases if case not in single][::_OTHERS]
+    return [
+        case if place % 6 == 0 else pytest.param(case, marks=pytest.mark.slow)
+        for place, case in enumerate([*single, *others])
+    ]
 
 
 def check(case: Case) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,35 +12,88 @@ import torch
 from benchmarks.stability import (
     Case,
     CaseResult,
+    all_cases,
+    case,
     format_cases,
     gaussian_cases,
     image_cases,
     job_cases,
     optimization_cases,
     precision_cases,
+    search,
     view_cases,
 )
-from benchmarks.stability.case import camera
+from benchmarks.stability.case import FLOAT32, PRECISIONS, camera, small_network, texture
+from benchmarks.stability.figure import compute_images, write_figure
 from sgsst_core.errors import DivergedError
+from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.rasterizer.projection import project
 from sgsst_core.rasterizer.reference import splat
 from tests.stability.hard_cases import check, parameters
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
 
-MODULES = (format_cases, gaussian_cases, image_cases, job_cases, precision_cases, view_cases)
+MODULES = (format_cases, gaussian_cases, image_cases, job_cases, precision_cases, search, view_cases)
 #: Cases of the optimizer take up to ten seconds each; the first one here is fast.
 OPTIMIZATION = sorted(optimization_cases.cases(), key=lambda case: case.name != "stopped and resumed in the middle")
-CASES = [
-    *(case for module in MODULES for case in parameters(module.cases())),
-    OPTIMIZATION[0],
-    *(pytest.param(case, marks=pytest.mark.slow) for case in OPTIMIZATION[1:]),
-]
+CASES = [*(case for module in MODULES for case in parameters(module.cases())), *parameters(OPTIMIZATION)]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_stays_within_its_bound(case: Case) -> None:
-    check(case)
+@pytest.mark.parametrize("hard_case", CASES, ids=lambda hard_case: f"{hard_case.name}, {hard_case.way}")
+def test_stays_within_its_bound(hard_case: Case) -> None:
+    check(hard_case)
+
+
+def test_each_case_has_a_name_of_its_own() -> None:
+    names = [(case.name, case.way) for case in all_cases()]
+    assert len(names) == len(set(names))
+    assert {way for _, way in names} == {way.name for way in (*job_cases.WAYS, job_cases.RANKS)}
+
+
+def test_precisions_round_as_much_as_they_say() -> None:
+    """The network really computes in each precision: its features differ from float64's by about that many bits."""
+    weights, image = small_network(64), texture(32, 40, 1)
+    exact = FeatureNetwork(weights, dtype=torch.float64).forward(image, cache=False).features["relu3_1"]
+    for way in PRECISIONS:
+        network = way.network(weights)
+        assert network.precision == way.precision
+        actual = network.forward(image, cache=False).features["relu3_1"].double() * network.feature_unit
+        error = float((actual - exact).norm() / exact.norm())
+        assert 2.0 ** -(way.bits + 6) < error < 2.0 ** -(way.bits - 2), way.name
+
+
+def test_search_counts_outcomes() -> None:
+    ended, failures = search.search(0.0, 3)
+    assert sum(ended.values()) == 1
+    assert not failures
+
+
+def test_search_reports_violated_bounds_and_unexpected_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {"steps_coarse": 0, "steps_sos": 1, "content_weight": 0}  # content has a bound of its own
+    situation = job_cases.Situation(job_cases.crowd(20), texture(30, 26, 1), settings)
+    assert search.outcome(situation, FLOAT32) == ("within its bounds", None)
+    with monkeypatch.context() as context:
+        context.setattr(job_cases, "REFERENCE_BOUND", 0.0)
+        context.setattr(case, "SAFETY", 0.0)
+        how, problem = search.outcome(situation, FLOAT32)
+    assert how == "broken"
+    assert "bound 0" in str(problem)
+    how, problem = search.outcome(replace(situation, scene=None), FLOAT32)  # type: ignore[arg-type]
+    assert how == "broken"
+    assert "Error" in str(problem)
+
+
+@pytest.mark.slow
+def test_figure_shows_where_published_formulas_fail(tmp_path: Path) -> None:
+    """The results here are finite, and differ visibly from the published ones."""
+    images = compute_images()
+    for name, (_, published, ours) in images.items():
+        assert bool(torch.isfinite(ours).all()), name
+        off = (published - ours).abs().clamp(max=1).nan_to_num(1)
+        assert float((off > 0.02).double().mean()) > 0.02, name
+    path = tmp_path / "stability.jpg"
+    write_figure(path, images)
+    assert path.stat().st_size < 300_000
 
 
 def test_non_finite_errors_do_not_pass() -> None:
