@@ -83,7 +83,7 @@ class Download:
             ApiError: If the response does not state the SHA-256 of the file.
             OutputError: If the disk is full.
         """
-        if response.status_code == httpx2.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
+        if response.status_code == httpx2.codes.RANGE_NOT_SATISFIABLE:
             return False
         stated = _SHA256.search(response.headers.get("etag", ""))
         if stated is None:
@@ -243,7 +243,7 @@ class Transport:
             async with self.http.stream("GET", download.path, headers=headers) as response:
                 self.reached = True
                 # Status 416 means that all bytes were received before.
-                if response.is_error and response.status_code != httpx2.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
+                if response.is_error and response.status_code != httpx2.codes.RANGE_NOT_SATISFIABLE:
                     await response.aread()
                     checked(response)
                 if await in_thread(download.begin, response):
