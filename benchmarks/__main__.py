@@ -59,6 +59,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     arguments = parse(parser)
+    if not (arguments.data / "scenes").is_dir() or not (arguments.data / "styles").is_dir():
+        parser.error(f"{arguments.data} has no folders scenes and styles: name the folder that has both")
     failed = []
     for name, pair, command in COMMANDS:
         if pair is not None and _is_current(name, pair):
