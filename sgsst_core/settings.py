@@ -373,7 +373,7 @@ class Settings(BaseModel):
         "auto",
         description="Precision of the feature network; winograd: float32 with fewer multiplications, on CPUs; tf32: "
         "for convolutions only; tf32 and float16: on NVIDIA GPUs; "
-        "auto: what the plan measures to be much faster than float32 with a small gradient error, else float32.",
+        "auto: the fastest that the processor computes by itself.",
     )
     max_resolution: Resolution = None
     background: Annotated[

@@ -445,15 +445,16 @@ def test_choice_fits_the_budget_and_nearly_uses_it(seconds: float) -> None:
     assert 0.8 * seconds < choice.seconds <= seconds
 
 
-def test_resolution_falls_before_steps_do_and_then_again() -> None:
-    whole, fewer, small = chosen(300), chosen(34), chosen(10)
-    assert whole.resolution > 256
-    assert (whole.steps_coarse, whole.steps_sos) == (0, 240)
-    assert fewer.resolution == 256
-    assert 0.2 * 240 - 2 <= fewer.steps_coarse + fewer.steps_sos < 240
-    assert small.resolution < 256
-    assert small.steps_sos >= 0.2 * 240 - 1 or small.resolution == 96
-    assert "; in 20 min 00 s: " in whole.decision(300, 240).reason
+def test_views_are_as_large_as_lets_a_quarter_of_the_steps_fit() -> None:
+    for seconds in (10, 34, 100):
+        choice = chosen(seconds)
+        assert 96 < choice.resolution < 1280
+        assert 60 <= choice.steps_sos < 120
+        assert not choice.steps_coarse
+    assert chosen(1).resolution == 96
+    preview = chosen(34, make_settings("preview", within=34))
+    assert (96 < preview.resolution < 1280, preview.steps_sos) == (True, 60)
+    assert "; in 20 min 00 s: " in chosen(300).decision(300, 81).reason
 
 
 def test_what_more_time_brings_is_more_than_the_steps() -> None:
