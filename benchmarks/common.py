@@ -156,12 +156,15 @@ def add_pair(
 ) -> Path:
     """Add rows with their `provenance` to one pair of scene and style, or another part, in `NAME.json`.
 
-    Other rows and pairs stay. Returns the path.
+    Other rows and pairs stay. Each row gets its own date and commit; those of the pair are of the latest row. Returns
+    the path.
     """
     path = RESULTS / f"{name}.json"
     pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
-    earlier = pairs.get(pair, {}).get("rows", {})
-    pairs[pair] = {**provenance(presets, scenes), **description, "rows": {**earlier, **rows}}
+    earlier, now = pairs.get(pair, {}).get("rows", {}), provenance(presets, scenes)
+    date = {key: now[key] for key in ("date", "commit")}
+    dated = {key: row | date if isinstance(row, dict) else row for key, row in rows.items()}
+    pairs[pair] = {**now, **description, "rows": {**earlier, **dated}}
     write_json(path, {"pairs": pairs})
     return path
 

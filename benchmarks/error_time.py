@@ -26,7 +26,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from benchmarks.common import RESULTS, add_pair, is_of_this_code, parse, provenance, read_views
+from benchmarks.common import RESULTS, add_pair, is_of_this_code, parse, read_views
 from benchmarks.cross_validation import SCENES
 from benchmarks.equal_steps import judge_and_loss, judged
 from benchmarks.job_parts import command_seconds
@@ -127,7 +127,7 @@ def run(data: Path, pair: str, ways: Sequence[str], seeds: Sequence[int]) -> Non
         loss = relative_loss(before, exact.evaluate(exact.views.covered, colors), exact.loss.weights)
         figures = {"seconds": seconds, "loss": loss, **judged(judge, colors)}
         row: Row = {figure: float(f"{value:.5g}") for figure, value in figures.items()}
-        row |= {"commit": provenance()["commit"], "views": job["cameras"]["count"], "sizes": job["cameras"]["sizes"]}
+        row |= {"views": job["cameras"]["count"], "sizes": job["cameras"]["sizes"]}
         row |= {"steps": len(job["history"]), "curve": curve(job) if way in BETTER.values() else None}
         add_pair("error_time", pair, description, {key: row}, presets=PRESETS, scenes={name: ply})
         print(f"{pair}, {key}: {table(key, {way: [row]}).splitlines()[-1]}", flush=True)

@@ -11,7 +11,8 @@ for ten rounds of the views, then the map again, with the optimizer of `standard
 steps.
 
 Consistency is measured on a path of neighboring views: halfway between the cameras of a file, or every 6 degrees of an
-orbit. Each pair is stored in benchmarks/results/methods.json when it is done; what is stored is not run again.
+orbit. Each pair is stored in benchmarks/results/methods.json when it is done; what is stored of the same code is not
+run again.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.common import RESULTS, add_pair, parse, read_views
+from benchmarks.common import RESULTS, add_pair, is_of_this_code, parse, read_views
 from benchmarks.cross_validation import DEMO, SCENES, inputs
 from benchmarks.equal_steps import UNSTYLIZED, judged
 from sgsst_core import Stylizer, load_image, make_settings
@@ -103,7 +104,7 @@ def main() -> None:
     arguments = parse(parser)
     if arguments.way == "run":
         for pair in PAIRS:
-            if pair not in stored():
+            if not is_of_this_code(_pairs().get(pair, {}).get("commit", "")):
                 rows = run(arguments.data, pair, arguments.resolution)
                 add_pair("methods", pair, {"resolution": arguments.resolution}, rows, presets=PRESETS)
                 print(f"## {pair}\n\n{table([rows])}\n", flush=True)
@@ -114,9 +115,12 @@ def main() -> None:
 
 def stored() -> dict[str, Rows]:
     """Return the stored rows of each pair."""
+    return {pair: each["rows"] for pair, each in _pairs().items()}
+
+
+def _pairs() -> dict[str, Any]:
     path = RESULTS / "methods.json"
-    pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
-    return {pair: each["rows"] for pair, each in pairs.items()}
+    return json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
 
 
 def run(data: Path, pair: str, resolution: int, **settings: Any) -> Rows:
