@@ -65,6 +65,14 @@ WAYS: dict[str, tuple[str, ...]] = {
     "standard": ("--preset", "standard"),
     "paper, 120 of 20,000 steps": ("--preset", "paper", "--steps-coarse", "60", "--steps-sos", "60"),
 }
+#: Options of `standard` with one of its choices changed; run if asked for.
+CHANGED: dict[str, tuple[str, ...]] = {
+    "standard, float32": ("--precision", "float32"),
+    "standard, bfloat16": ("--precision", "bfloat16"),
+    "standard, all scales in each step": ("--scale-sampling", "1"),
+    "standard, no early stop": ("--no-early-stop",),
+}
+EVERY_WAY = WAYS | CHANGED
 BUDGETS = [way for way in WAYS if way.startswith("within")]
 #: Presets that minimize the same loss, each with the next better one.
 BETTER = {"preview": "standard"}
@@ -89,7 +97,7 @@ def main() -> None:
     running = ways.add_parser("run")
     running.add_argument("data", type=Path, help="folder with scenes/ and styles/")
     running.add_argument("--pairs", nargs="+", choices=PAIRS, default=PAIRS, metavar="PAIR")
-    running.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS), metavar="WAY")
+    running.add_argument("--ways", nargs="+", choices=EVERY_WAY, default=list(WAYS), metavar="WAY")
     running.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     ways.add_parser("show").add_argument("--figure", type=Path, help="PNG to write")
     arguments = parse(parser)
@@ -121,7 +129,7 @@ def run(data: Path, pair: str, ways: Sequence[str], seeds: Sequence[int]) -> Non
             out, views = Path(folder, "out.ply"), Path(folder, "cameras.json")
             write_cameras(views, cameras)
             inputs = [str(ply), "--cameras", str(views), "--style", str(style), "--backbone", "vgg16"]
-            seconds = command_seconds(["stylize", *inputs, "--out", str(out), "--seed", str(seed), *WAYS[way]])
+            seconds = command_seconds(["stylize", *inputs, "--out", str(out), "--seed", str(seed), *EVERY_WAY[way]])
             colors = read_scene(out).scene.sh_dc
             job = json.loads(out.with_suffix(".report.json").read_text(encoding="utf-8"))
         loss = relative_loss(before, exact.evaluate(exact.views.covered, colors), exact.loss.weights)
@@ -173,8 +181,8 @@ def stored() -> dict[str, dict[str, Row]]:
 
 
 def runs_of(rows: dict[str, Row]) -> Runs:
-    """Return rows, which are stored as "WAY, seed N", by way, in the order of `WAYS`."""
-    runs = {way: [row for key, row in rows.items() if key.rpartition(", seed ")[0] == way] for way in WAYS}
+    """Return rows, which are stored as "WAY, seed N", by way, in the order of `EVERY_WAY`."""
+    runs = {way: [row for key, row in rows.items() if key.rpartition(", seed ")[0] == way] for way in EVERY_WAY}
     return {way: own for way, own in runs.items() if own}
 
 
