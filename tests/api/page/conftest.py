@@ -1,6 +1,7 @@
 """Fixtures of the page's tests: a browser and a service."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -28,21 +29,27 @@ def service(whole_service: Service) -> Service:
 
 @pytest.fixture
 def visit(browser: Any, service: Service) -> Iterator[Callable[..., Watched]]:
-    """Yield a function that opens pages of the service, each in a separate browser context.
+    """Yield a function that opens pages of the service or of a file, each in a separate browser context.
 
-    Jobs that the test has left unfinished are canceled, or those of later tests would wait for them.
+    Pages are checked after the test; `allowed` has texts of console errors that may occur. Jobs that the test has left
+    unfinished are canceled, or those of later tests would wait for them.
     """
-    opened: list[Watched] = []
+    with ExitStack() as stack:
+        stack.callback(cancel_all, service)
 
-    def visit(path: str = "/", **context: Any) -> Watched:
-        watched = Watched(browser, service.url, **context)
-        opened.append(watched)
-        watched.page.goto(service.url + path)
-        return watched
+        def visit(address: str = "/", *, allowed: Sequence[str] = (), **context: Any) -> Watched:
+            url = address if "://" in address else service.url + address
+            watched = Watched(browser, service.url if url.startswith(service.url) else url, **context)
+            stack.callback(watched.context.close)
+            stack.callback(watched.check, *allowed)
+            watched.page.goto(url)
+            return watched
 
-    yield visit
-    for watched in opened:
-        watched.context.close()
+        yield visit
+
+
+def cancel_all(service: Service) -> None:
+    """Cancel all jobs that have not ended."""
     with service.client() as client:
         for job in client.get("/v1/jobs", params={"limit": 200}).json()["jobs"]:
             if job["status"] in ("queued", "running"):

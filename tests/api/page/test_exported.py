@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -14,7 +13,8 @@ from sgsst_core.files.scene_file import write_scene
 from sgsst_core.quality.study import count_votes
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from tests.api.page.browser import Watched, in_frame, psnr, rendered
+from tests.api.page.actions import Visit
+from tests.api.page.browser import in_frame, psnr, rendered
 from tests.small_scenes import ball, cameras, wall, write_files
 
 
@@ -36,10 +36,9 @@ def export(folder: Path, stylized: Scene, original: Scene | None, *options: str)
 
 
 @pytest.mark.slow
-def test_exported_page_wipes_between_both_colors(tmp_path: Path, browser: Any) -> None:
+def test_exported_page_wipes_between_both_colors(tmp_path: Path, visit: Visit) -> None:
     assert export(tmp_path, painted(0.9, 0.1, 0.1), painted(0.1, 0.1, 0.9), "--title", "Red <&> blue") == 0
-    page = Watched(browser, (tmp_path / "page.html").as_uri())
-    page.page.goto(page.url)
+    page = visit((tmp_path / "page.html").as_uri())
     assert page.page.title() == "Red <&> blue"
     page.wipe("Home")
     red = page.pixels().max(axis=(0, 1))
@@ -51,18 +50,15 @@ def test_exported_page_wipes_between_both_colors(tmp_path: Path, browser: Any) -
     style.fill("0")
     page.wipe("Home")
     assert page.pixels().max(axis=(0, 1)) == pytest.approx(blue, abs=3)
-    page.check()
-    page.context.close()
 
 
 @pytest.mark.slow
-def test_exported_page_opens_at_the_chosen_camera_and_jumps_to_others(tmp_path: Path, browser: Any) -> None:
+def test_exported_page_opens_at_the_chosen_camera_and_jumps_to_others(tmp_path: Path, visit: Visit) -> None:
     scene, views = wall(sh_degree=1), cameras(4, 96, 72)  # each looks at it slantwise, so that depths differ
     write_files(tmp_path, scene, views)
     given = ["--cameras", str(tmp_path / "cameras.json"), "--start", "view_2", "--views", "view_0,view_1"]
     assert export(tmp_path, scene, None, *given) == 0
-    page = Watched(browser, (tmp_path / "page.html").as_uri(), width=900, reduced_motion="reduce")
-    page.page.goto(page.url)
+    page = visit((tmp_path / "page.html").as_uri(), width=900, reduced_motion="reduce")
 
     def assert_shown(camera: Camera) -> None:
         pixels = page.pixels()
@@ -79,8 +75,6 @@ def test_exported_page_opens_at_the_chosen_camera_and_jumps_to_others(tmp_path: 
     page.page.keyboard.press("3")
     assert_shown(views[0])
     assert page.page.locator("form").count() == 0, "its viewers change nothing"
-    page.check()
-    page.context.close()
 
 
 @pytest.mark.parametrize(
@@ -137,14 +131,13 @@ def test_page_must_be_an_html_file(tmp_path: Path, capsys: pytest.CaptureFixture
 
 @pytest.mark.slow
 def test_votes_by_arrow_keys_are_saved_and_counted(
-    browser: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    visit: Visit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene, cameras, style = write_files(tmp_path, ball())
     page, key = tmp_path / "study.html", tmp_path / "study.key.json"
     variants = [f"{name}={scene}" for name in ("warm-start", "cold-start", "third-way")]
     assert main(["study", "make", *variants, "--cameras", str(cameras), "--style", str(style), "--out", str(page)]) == 0
-    watched = Watched(browser, page.as_uri())
-    watched.page.goto(page.as_uri())
+    watched = visit(page.as_uri())
     known = json.loads(key.read_text())
     for _ in known["views"]:
         watched.page.keyboard.press("ArrowDown")
@@ -155,10 +148,8 @@ def test_votes_by_arrow_keys_are_saved_and_counted(
         watched.page.get_by_role("button", name="Save votes").click()
     votes = tmp_path / "votes.json"
     download.value.save_as(votes)
-    assert watched.wrong == []
     shares = count_votes(key, [votes])
     assert sum(share.votes for share in shares) == shares[0].total == len(known["views"])
     capsys.readouterr()
     assert main(["study", "count", str(key), str(votes)]) == 0
     assert f"{len(known['views'])} votes" in capsys.readouterr().out
-    watched.context.close()

@@ -95,7 +95,6 @@ def test_faces_of_panoramas_are_those_of_the_service(visit: Visit, files: dict[s
         assert all(each[key] == getattr(camera, key) for key in ("fx", "fy", "width", "height"))
         assert np.allclose(each["position"], camera.center.numpy(), atol=1e-12)
         assert np.allclose(each["axes"], camera.world_to_camera[:3, :3].numpy(), atol=1e-12)
-    watched.check()
 
 
 @pytest.mark.parametrize(("name", "degree"), [("broche", 0), ("playbot_synthetic_sh2", 2), ("snowmiku_plush", 3)])
@@ -107,7 +106,6 @@ def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path:
     for camera in views:
         pixels = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
         assert psnr(pixels, rendered(tmp_path / "scene.ply", camera)) >= FAITHFUL, camera.name
-    watched.check()
 
 
 @pytest.mark.parametrize(
@@ -138,7 +136,6 @@ def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path
     for camera in views[:2]:
         pixels = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
         assert psnr(pixels, rendered(ply, camera)) >= FAITHFUL, camera.name
-    watched.check()
 
 
 @pytest.mark.parametrize(
@@ -287,7 +284,6 @@ def assert_shown_like(watched: Watched, folder: Path, scene: Path, *, differs: b
     image = make_rasterizer("cpu", classic).render(scene_colors(classic, camera), camera)
     expected = np.rint(image.clamp(0, 1).double().numpy() * 255)
     assert (psnr(pixels, expected) < 35) == differs
-    watched.check()
 
 
 def splat_bytes(scene: Scene) -> bytes:
@@ -311,7 +307,6 @@ def test_old_spz_is_shown(visit: Visit, tmp_path: Path, version: int, stated: bo
     watched, camera = visit("/#/jobs"), cameras()[0]
     pixels = decoded(shown(watched, tmp_path, camera.name, (camera.width, camera.height)))
     assert psnr(pixels, rendered(ply, camera)) >= FAITHFUL
-    watched.check()
 
 
 def old_spz(scene: Scene, version: int, rub: bool) -> bytes:
@@ -452,7 +447,8 @@ def test_lost_graphics_device_comes_back(visit: Visit, tmp_path: Path) -> None:
       while (!there()) await new Promise((go) => setTimeout(go, 20));
       return [before, await picture()];
     }"""
-    before, after = map(decoded, shown(visit("/#/jobs"), tmp_path, "view_1", (128, 96), steps))
+    watched = visit("/#/jobs", allowed=["WebGL"])
+    before, after = map(decoded, shown(watched, tmp_path, "view_1", (128, 96), steps))
     assert np.array_equal(before, after)
 
 
@@ -478,7 +474,6 @@ def test_files_that_cannot_be_shown(visit: Visit, tmp_path: Path, content: bytes
     file.write_bytes(content)
     watched.page.get_by_label("Scene", exact=True).set_input_files(file)
     watched.page.locator(".frame .note").filter(has_text=said).wait_for()
-    watched.check()
 
 
 @pytest.mark.parametrize(("form", "front"), [("sog", "red"), ("ply", "blue")])
@@ -527,7 +522,6 @@ def test_camera_follows_keys_and_double_clicks(visit: Visit, tmp_path: Path) -> 
     page.keyboard.press("Home")
     assert np.abs(watched.pixels() - image).mean() < 1
     assert np.abs(turned - image).mean() > 1
-    watched.check()
 
 
 def place_of_red(watched: Watched) -> tuple[float, Any]:
