@@ -7,6 +7,7 @@ from pathlib import Path
 import httpx2
 import pytest
 
+from api.cli.main import main
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from tests.api.service import Service, wait_for
@@ -14,8 +15,22 @@ from tests.small_scenes import wall, write_files
 
 #: Function that returns a running service with these settings, which tests of other files use too.
 Services = Callable[..., Service]
+#: Function that runs a command, and returns what it prints: errors if its exit code should not be 0.
+Sgsst = Callable[..., str]
 #: Settings of a service that requires keys, and believes no proxy.
 KEYED = {"SGSST_REQUIRE_KEYS": "true", "SGSST_TRUSTED_PROXIES": ""}
+
+
+@pytest.fixture
+def sgsst(capsys: pytest.CaptureFixture[str]) -> Sgsst:
+    """Return a function that runs a command, and fails unless it ends with an exit code, by default 0."""
+
+    def run(arguments: list[str], code: int = 0) -> str:
+        assert main(arguments) == code
+        printed = capsys.readouterr()
+        return printed.err if code else printed.out
+
+    return run
 
 
 @pytest.fixture(scope="package")

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import numpy as np
 import pytest
 from PIL import Image
@@ -73,25 +74,28 @@ MIRRORED = (CAMERA.world_to_camera * -1)[:3].tolist()
     ],
 )  # fmt: skip
 def test_unusable_paintings_are_refused(
-    service: Service, folder: Path, painted: dict[str, bytes], parameters: dict[str, Any], code: str, role: str | None
+    client: httpx2.Client,
+    folder: Path,
+    painted: dict[str, bytes],
+    parameters: dict[str, Any],
+    code: str,
+    role: str | None,
 ) -> None:
     names = {"scene": "scene.ply", "cameras": "cameras.json"}
     fields = [(role, (name, (folder / name).read_bytes())) for role, name in names.items()]
     fields += [("painted", file) for file in painted.items()]
-    with service.client() as client:
-        before = client.get("/v1/jobs").json()["jobs"]
-        answer = client.post("/v1/jobs", files=fields, data={"parameters": json.dumps(parameters)})
-        assert refused(answer, 422, code).get("input") == role
-        assert client.get("/v1/jobs").json()["jobs"] == before
+    before = client.get("/v1/jobs").json()["jobs"]
+    answer = client.post("/v1/jobs", files=fields, data={"parameters": json.dumps(parameters)})
+    assert refused(answer, 422, code).get("input") == role
+    assert client.get("/v1/jobs").json()["jobs"] == before
 
 
-def test_style_and_missing_result_are_refused(service: Service, folder: Path) -> None:
+def test_style_and_missing_result_are_refused(client: httpx2.Client, folder: Path) -> None:
     missing = "/v1/jobs/job_1a1fe701a104f943e9d4d8cce5b818c/artifacts/stylized.ply"
-    with service.client() as client:
-        files = [(role, (role, b"x")) for role in ("scene", "style", "painted")]
-        assert refused(client.post("/v1/jobs", files=files), 422, "invalid-request")["input"] == "style"
-        answer = client.post("/v1/jobs", json={"scene": missing, "painted": [missing]})
-        assert refused(answer, 422, "unknown-input")["input"] == "scene"
+    files = [(role, (role, b"x")) for role in ("scene", "style", "painted")]
+    assert refused(client.post("/v1/jobs", files=files), 422, "invalid-request")["input"] == "style"
+    answer = client.post("/v1/jobs", json={"scene": missing, "painted": [missing]})
+    assert refused(answer, 422, "unknown-input")["input"] == "scene"
 
 
 def test_scene_follows_painted_views(whole_service: Service, folder: Path, tmp_path: Path) -> None:

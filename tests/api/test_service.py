@@ -127,114 +127,112 @@ def check_course(client: httpx2.Client, job_id: str, steps: list[int]) -> None:
         assert np.isclose(np.mean(seen), point["loss"]), "all scales count alike"
 
 
-def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], tmp_path: Path) -> None:
-    with service.client() as client:
-        job_id = submit(client, files, name="my wall", steps_sos=FEW_STEPS)
-        seen = events(client, job_id)  # returns when the job has ended
-        kinds = [(kind, data.get("status") or data.get("name")) for _, kind, data in seen]
-        statuses = [what for kind, what in kinds if kind == "status"]
-        assert statuses == ["queued", "starting", "running", "succeeded"]
-        assert kinds.index(("artifact", "plan.json")) < kinds.index(("status", "succeeded"))
-        assert any(kind == "artifact" and str(what).startswith("previews/") for kind, what in kinds)
-        last_step = max(number for number, (kind, _) in enumerate(kinds) if kind == "progress")
-        assert kinds.index(("artifact", "log.txt")) < last_step, "the log can be read while the job runs"
-        progress = [data for _, kind, data in seen if kind == "progress"]
-        steps = [data["step"] for data in progress if data["stage"] != "planning"]  # steps of planning are views
-        assert all(0 <= data["step"] <= data["total"] == 3 for data in progress if data["stage"] == "planning")
-        assert all(datetime.fromisoformat(data["updated_at"]).tzinfo for _, kind, data in seen if kind == "progress")
-        assert steps == sorted(steps)
-        assert steps[-1] == FEW_STEPS
-        middle = seen[len(seen) // 2][0]
-        assert events(client, job_id, after=middle) == [event for event in seen if event[0] > middle]
-        assert events(client, job_id, after=seen[-1][0]) == []
+def test_job_from_submission_to_ply(
+    service: Service, client: httpx2.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    job_id = submit(client, files, name="my wall", steps_sos=FEW_STEPS)
+    seen = events(client, job_id)  # returns when the job has ended
+    kinds = [(kind, data.get("status") or data.get("name")) for _, kind, data in seen]
+    statuses = [what for kind, what in kinds if kind == "status"]
+    assert statuses == ["queued", "starting", "running", "succeeded"]
+    assert kinds.index(("artifact", "plan.json")) < kinds.index(("status", "succeeded"))
+    assert any(kind == "artifact" and str(what).startswith("previews/") for kind, what in kinds)
+    last_step = max(number for number, (kind, _) in enumerate(kinds) if kind == "progress")
+    assert kinds.index(("artifact", "log.txt")) < last_step, "the log can be read while the job runs"
+    progress = [data for _, kind, data in seen if kind == "progress"]
+    steps = [data["step"] for data in progress if data["stage"] != "planning"]  # steps of planning are views
+    assert all(0 <= data["step"] <= data["total"] == 3 for data in progress if data["stage"] == "planning")
+    assert all(datetime.fromisoformat(data["updated_at"]).tzinfo for _, kind, data in seen if kind == "progress")
+    assert steps == sorted(steps)
+    assert steps[-1] == FEW_STEPS
+    middle = seen[len(seen) // 2][0]
+    assert events(client, job_id, after=middle) == [event for event in seen if event[0] > middle]
+    assert events(client, job_id, after=seen[-1][0]) == []
 
-        first = client.get(f"/v1/jobs/{job_id}")
-        shown_job = first.json()
-        assert (shown_job["status"], shown_job["name"], shown_job["attempt"]) == ("succeeded", "my wall", 1)
-        assert shown_job["progress"]["fraction"] == 1
-        assert shown_job["result"]["loss_after"] < shown_job["result"]["loss_before"]
-        assert shown_job["result"]["steps"] == shown_job["result"]["total"] == FEW_STEPS
-        same = client.get(f"/v1/jobs/{job_id}", headers={"If-None-Match": first.headers["etag"]})
-        assert (same.status_code, same.content) == (304, b"")
-        listed = client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]
-        names = {entry["name"] for entry in listed}
-        assert {"stylized.ply", "plan.json", "report.json", "report.html", "log.txt"} <= names
-        assert not any(name.startswith(".") for name in names)
-        assert shown_job["preview"] == max(name for name in names if name.startswith("previews/"))
-        check_colors(client, job_id, files["scene"])
-        check_course(client, job_id, steps)
-        for entry in listed:
-            content = client.get(entry["url"])
-            assert hashlib.sha256(content.content).hexdigest() == entry["sha256"] == content.headers["etag"].strip('"')
-            assert content.headers["content-type"] == entry["media_type"]
-            assert str(service.data).encode() not in content.content, (
-                f"{entry['name']} tells where the service's data is"
-            )
-        assert result(client, job_id) == stylized(files, service, tmp_path, FEW_STEPS)
+    first = client.get(f"/v1/jobs/{job_id}")
+    shown_job = first.json()
+    assert (shown_job["status"], shown_job["name"], shown_job["attempt"]) == ("succeeded", "my wall", 1)
+    assert shown_job["progress"]["fraction"] == 1
+    assert shown_job["result"]["loss_after"] < shown_job["result"]["loss_before"]
+    assert shown_job["result"]["steps"] == shown_job["result"]["total"] == FEW_STEPS
+    same = client.get(f"/v1/jobs/{job_id}", headers={"If-None-Match": first.headers["etag"]})
+    assert (same.status_code, same.content) == (304, b"")
+    listed = client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]
+    names = {entry["name"] for entry in listed}
+    assert {"stylized.ply", "plan.json", "report.json", "report.html", "log.txt"} <= names
+    assert not any(name.startswith(".") for name in names)
+    assert shown_job["preview"] == max(name for name in names if name.startswith("previews/"))
+    check_colors(client, job_id, files["scene"])
+    check_course(client, job_id, steps)
+    for entry in listed:
+        content = client.get(entry["url"])
+        assert hashlib.sha256(content.content).hexdigest() == entry["sha256"] == content.headers["etag"].strip('"')
+        assert content.headers["content-type"] == entry["media_type"]
+        assert str(service.data).encode() not in content.content, f"{entry['name']} tells where the service's data is"
+    assert result(client, job_id) == stylized(files, service, tmp_path, FEW_STEPS)
     modes = {path: status.st_mode for path, status in service.stored().items() if stat.S_ISREG(status.st_mode)}
     assert not [path for path, mode in modes.items() if mode & 0o077]
 
 
 @pytest.mark.slow
 def test_compressed_scene_and_results_in_other_formats(
-    service: Service, files: dict[str, Path], tmp_path: Path
+    service: Service, client: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     scene, gaussians = tmp_path / "wall.ply", wall(sh_degree=1)
     gaussians.means[:, 2] += torch.linspace(0, 0.3, 616)  # at equal depths, the image would depend on their order
     write_scene(scene, gaussians, SPZ)
-    with service.client() as client:
-        job_id = submit(client, files | {"scene": scene}, steps_sos=5)
-        where = f"/v1/jobs/{job_id}/artifacts/stylized.ply"
-        assert client.get(where, params={"format": "spz"}).status_code == 404
-        wait_until(service, client, job_id, "succeeded")
-        ply = read(tmp_path, client.get(where).content)
-        assert ply.format == "ply"
-        assert torch.equal(ply.scene.means, read_scene(scene).scene.means)
-        for form in (each.name for each in EXTRA_FORMATS):
-            first = client.get(where, params={"format": form})
-            assert first.status_code == 200, first.text
-            suggested = f'attachment; filename="{scene.stem}_style-stylized.{form}"'
-            assert first.headers["content-disposition"].startswith(suggested)
-            assert first.headers["content-type"] == by_name(form).media_type
-            result = read(tmp_path, first.content)
-            assert (result.format, len(result.scene)) == (form, len(ply.scene))
-            again = client.get(where, params={"format": form}, headers={"If-None-Match": first.headers["etag"]})
-            assert again.status_code == 304, "it is kept"
-            assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.{form}").content == first.content
-            loss = client.get(f"/v1/jobs/{job_id}/artifacts/stylized.{form}.json").json()
-            assert (loss["name"], loss["format"], loss["bytes"]) == (f"stylized.{form}", form, len(first.content))
-            assert loss["psnr_db"] is None or loss["psnr_db"] > 35
-            assert loss["views"] == ["view_0", "view_1", "view_2"]
-        names = {entry["name"] for entry in client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]}
-        assert {"stylized.spz", "stylized.spz.json", "stylized.compressed.ply"} <= names
-        assert client.get(where, params={"format": "ply"}).content == client.get(where).content
-        assert client.get(where, params={"format": "splat"}).json()["code"] == "invalid-request"
-        page = client.get(where, params={"format": "html"})
-        suggested = f'attachment; filename="{scene.stem}_style-stylized.html"'
-        assert page.headers["content-disposition"].startswith(suggested)
-        assert page.headers["content-type"] == "text/html; charset=utf-8"
-        assert '<script type="text/plain" id="colors"></script>' not in page.text, "the scene's colors are there too"
-        assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.html").content == page.content
-        other = client.get(f"/v1/jobs/{job_id}/artifacts/report.json", params={"format": "spz"})
-        assert (other.status_code, other.json()["code"]) == (422, "invalid-request")
-        assert list((service.data / "packing").iterdir()) == []
-        with Client(service.url) as user:
-            user.download(job_id, tmp_path / "mine", format="spz")
-            assert (tmp_path / "mine").read_bytes() == client.get(where, params={"format": "spz"}).content
-            assert user.download(job_id, tmp_path / "scene.html").read_text() == page.text
-            assert read_scene(user.download(job_id, tmp_path / "scene.sog")).format == "sog"
-            assert user.download(job_id, tmp_path / "plain").read_bytes() == client.get(where).content
-            with pytest.raises(OutputError, match="does not end in"):
-                user.download(job_id, tmp_path / "scene.usdz")
-        command = [sys.executable, "-m", "api.cli", "download", job_id, "--url", service.url]
-        command += ["--out", str(tmp_path / "other.compressed.ply")]
-        ended = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
-        assert "compressed.ply, " in ended.stderr
-        assert "dB PSNR against the PLY" in ended.stderr
-        assert read_scene(tmp_path / "other.compressed.ply").format == "compressed.ply"
-        assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
-        assert client.get(where, params={"format": "spz"}).status_code == 404
-        assert not (service.data / "artifacts" / job_id).exists()
+    job_id = submit(client, files | {"scene": scene}, steps_sos=5)
+    where = f"/v1/jobs/{job_id}/artifacts/stylized.ply"
+    assert client.get(where, params={"format": "spz"}).status_code == 404
+    wait_until(service, client, job_id, "succeeded")
+    ply = read(tmp_path, client.get(where).content)
+    assert ply.format == "ply"
+    assert torch.equal(ply.scene.means, read_scene(scene).scene.means)
+    for form in (each.name for each in EXTRA_FORMATS):
+        first = client.get(where, params={"format": form})
+        assert first.status_code == 200, first.text
+        suggested = f'attachment; filename="{scene.stem}_style-stylized.{form}"'
+        assert first.headers["content-disposition"].startswith(suggested)
+        assert first.headers["content-type"] == by_name(form).media_type
+        result = read(tmp_path, first.content)
+        assert (result.format, len(result.scene)) == (form, len(ply.scene))
+        again = client.get(where, params={"format": form}, headers={"If-None-Match": first.headers["etag"]})
+        assert again.status_code == 304, "it is kept"
+        assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.{form}").content == first.content
+        loss = client.get(f"/v1/jobs/{job_id}/artifacts/stylized.{form}.json").json()
+        assert (loss["name"], loss["format"], loss["bytes"]) == (f"stylized.{form}", form, len(first.content))
+        assert loss["psnr_db"] is None or loss["psnr_db"] > 35
+        assert loss["views"] == ["view_0", "view_1", "view_2"]
+    names = {entry["name"] for entry in client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]}
+    assert {"stylized.spz", "stylized.spz.json", "stylized.compressed.ply"} <= names
+    assert client.get(where, params={"format": "ply"}).content == client.get(where).content
+    assert client.get(where, params={"format": "splat"}).json()["code"] == "invalid-request"
+    page = client.get(where, params={"format": "html"})
+    suggested = f'attachment; filename="{scene.stem}_style-stylized.html"'
+    assert page.headers["content-disposition"].startswith(suggested)
+    assert page.headers["content-type"] == "text/html; charset=utf-8"
+    assert '<script type="text/plain" id="colors"></script>' not in page.text, "the scene's colors are there too"
+    assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.html").content == page.content
+    other = client.get(f"/v1/jobs/{job_id}/artifacts/report.json", params={"format": "spz"})
+    assert (other.status_code, other.json()["code"]) == (422, "invalid-request")
+    assert list((service.data / "packing").iterdir()) == []
+    with Client(service.url) as user:
+        user.download(job_id, tmp_path / "mine", format="spz")
+        assert (tmp_path / "mine").read_bytes() == client.get(where, params={"format": "spz"}).content
+        assert user.download(job_id, tmp_path / "scene.html").read_text() == page.text
+        assert read_scene(user.download(job_id, tmp_path / "scene.sog")).format == "sog"
+        assert user.download(job_id, tmp_path / "plain").read_bytes() == client.get(where).content
+        with pytest.raises(OutputError, match="does not end in"):
+            user.download(job_id, tmp_path / "scene.usdz")
+    command = [sys.executable, "-m", "api.cli", "download", job_id, "--url", service.url]
+    command += ["--out", str(tmp_path / "other.compressed.ply")]
+    ended = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
+    assert "compressed.ply, " in ended.stderr
+    assert "dB PSNR against the PLY" in ended.stderr
+    assert read_scene(tmp_path / "other.compressed.ply").format == "compressed.ply"
+    assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
+    assert client.get(where, params={"format": "spz"}).status_code == 404
+    assert not (service.data / "artifacts" / job_id).exists()
 
 
 def read(folder: Path, data: bytes) -> SceneFile:
@@ -244,84 +242,84 @@ def read(folder: Path, data: bytes) -> SceneFile:
 
 
 @pytest.mark.slow
-def test_retried_job_resumes_from_checkpoint(service: Service, files: dict[str, Path], expected: bytes) -> None:
-    with service.client() as client:
-        job_id = submit(client, files)
-        wait_for_step(service, client, job_id, 10)
-        assert client.post(f"/v1/jobs/{job_id}/cancel").json()["status"] == "canceling"
-        assert client.delete(f"/v1/jobs/{job_id}").status_code == 409
-        canceled = wait_until(service, client, job_id, "canceled")
-        assert canceled["attempts"][0]["outcome"] == "canceled"
-        assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").status_code == 404
-        assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
-        assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 202
-        seen = events(client, job_id)
-        wait_until(service, client, job_id, "succeeded")
-        second = [data["step"] for _, kind, data in seen if kind == "progress" and data["attempt"] == 2]
-        assert min(step for step in second if step) >= 10, "it started over"
-        assert result(client, job_id) == expected
-        assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 409
-        assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
+def test_retried_job_resumes_from_checkpoint(
+    service: Service, client: httpx2.Client, files: dict[str, Path], expected: bytes
+) -> None:
+    job_id = submit(client, files)
+    wait_for_step(service, client, job_id, 10)
+    assert client.post(f"/v1/jobs/{job_id}/cancel").json()["status"] == "canceling"
+    assert client.delete(f"/v1/jobs/{job_id}").status_code == 409
+    canceled = wait_until(service, client, job_id, "canceled")
+    assert canceled["attempts"][0]["outcome"] == "canceled"
+    assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").status_code == 404
+    assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
+    assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 202
+    seen = events(client, job_id)
+    wait_until(service, client, job_id, "succeeded")
+    second = [data["step"] for _, kind, data in seen if kind == "progress" and data["attempt"] == 2]
+    assert min(step for step in second if step) >= 10, "it started over"
+    assert result(client, job_id) == expected
+    assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 409
+    assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
 
 
 @pytest.mark.slow
-def test_stopped_job_is_continued(service: Service, files: dict[str, Path], expected: bytes) -> None:
+def test_stopped_job_is_continued(
+    service: Service, client: httpx2.Client, files: dict[str, Path], expected: bytes
+) -> None:
     """The result stays until the new one, which is that of a job that was never stopped; its derived files do not."""
-    with service.client() as client:
-        job_id = submit(client, files)
-        wait_for_step(service, client, job_id, 10)
-        assert client.post(f"/v1/jobs/{job_id}/finish").status_code == 200
-        ended = wait_until(service, client, job_id, "succeeded")
-        stopped = ended["result"]
-        assert (stopped["stopped"], stopped["steps"] < stopped["total"]) == ("on-request", True)
-        assert (ended["progress"]["eta_s"], client.post(f"/v1/jobs/{job_id}/finish").status_code) == (None, 409)
-        report = client.get(f"/v1/jobs/{job_id}/artifacts/report.json").json()
-        assert (report["stopped"], sum(each["done"] for each in report["steps"].values())) == (
-            "on-request",
-            stopped["steps"],
-        )
-        assert "stopped on request" in client.get(f"/v1/jobs/{job_id}/artifacts/report.html").text
-        derived = f"/v1/jobs/{job_id}/artifacts/stylized.ply?format=spz"
-        first = client.get(derived).content
-        assert client.post(f"/v1/jobs/{job_id}/retry").json()["result"] is None
-        assert "stylized.spz" not in client.get(f"/v1/jobs/{job_id}/artifacts").text
-        final = wait_until(service, client, job_id, "succeeded")
-        assert (final["result"]["stopped"], final["attempt"]) == ("finished", 2)
-        steps = [
-            data["step"] for _, kind, data in events(client, job_id) if kind == "progress" and data["attempt"] == 2
-        ]
-        assert min(step for step in steps if step) >= stopped["steps"], "it started over"
-        assert result(client, job_id) == expected
-        assert client.get(derived).content != first
-        assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
+    job_id = submit(client, files)
+    wait_for_step(service, client, job_id, 10)
+    assert client.post(f"/v1/jobs/{job_id}/finish").status_code == 200
+    ended = wait_until(service, client, job_id, "succeeded")
+    stopped = ended["result"]
+    assert (stopped["stopped"], stopped["steps"] < stopped["total"]) == ("on-request", True)
+    assert (ended["progress"]["eta_s"], client.post(f"/v1/jobs/{job_id}/finish").status_code) == (None, 409)
+    report = client.get(f"/v1/jobs/{job_id}/artifacts/report.json").json()
+    assert (report["stopped"], sum(each["done"] for each in report["steps"].values())) == (
+        "on-request",
+        stopped["steps"],
+    )
+    assert "stopped on request" in client.get(f"/v1/jobs/{job_id}/artifacts/report.html").text
+    derived = f"/v1/jobs/{job_id}/artifacts/stylized.ply?format=spz"
+    first = client.get(derived).content
+    assert client.post(f"/v1/jobs/{job_id}/retry").json()["result"] is None
+    assert "stylized.spz" not in client.get(f"/v1/jobs/{job_id}/artifacts").text
+    final = wait_until(service, client, job_id, "succeeded")
+    assert (final["result"]["stopped"], final["attempt"]) == ("finished", 2)
+    steps = [data["step"] for _, kind, data in events(client, job_id) if kind == "progress" and data["attempt"] == 2]
+    assert min(step for step in steps if step) >= stopped["steps"], "it started over"
+    assert result(client, job_id) == expected
+    assert client.get(derived).content != first
+    assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
 
 
 @pytest.mark.slow
-def test_request_to_finish_outlives_its_attempt(service: Service, files: dict[str, Path]) -> None:
+def test_request_to_finish_outlives_its_attempt(
+    service: Service, client: httpx2.Client, files: dict[str, Path]
+) -> None:
     """The next attempt resumes, makes a step and writes its result."""
-    with service.client() as client:
-        job_id = submit(client, files, steps_sos=1_000_000)
-        wait_for_step(service, client, job_id, 5)
-        running = service.process("service.scheduling.attempt_process")
-        assert running is not None
-        running.suspend()
-        client.post(f"/v1/jobs/{job_id}/finish")
-        running.kill()
-        final = wait_until(service, client, job_id, "succeeded", "failed")
-        assert [attempt["outcome"] for attempt in final["attempts"]] == ["failed", "succeeded"]
-        assert final["result"]["stopped"] == "on-request"
+    job_id = submit(client, files, steps_sos=1_000_000)
+    wait_for_step(service, client, job_id, 5)
+    running = service.process("service.scheduling.attempt_process")
+    assert running is not None
+    running.suspend()
+    client.post(f"/v1/jobs/{job_id}/finish")
+    running.kill()
+    final = wait_until(service, client, job_id, "succeeded", "failed")
+    assert [attempt["outcome"] for attempt in final["attempts"]] == ["failed", "succeeded"]
+    assert final["result"]["stopped"] == "on-request"
 
 
-def test_queued_job_is_canceled_immediately(service: Service, files: dict[str, Path]) -> None:
-    with service.client() as client:
-        first, second = (submit(client, files, steps_sos=1_000_000) for _ in range(2))
-        assert client.post(f"/v1/jobs/{second}/cancel").json()["status"] == "canceled"
-        client.post(f"/v1/jobs/{first}/cancel")
-        wait_until(service, client, first, "canceled")
-        page = client.get("/v1/jobs", params={"limit": 1, "status": "canceled"}).json()
-        assert [entry["id"] for entry in page["jobs"]] == [second]
-        following = client.get("/v1/jobs", params={"limit": 1, "status": "canceled", "cursor": page["next_cursor"]})
-        assert [entry["id"] for entry in following.json()["jobs"]] == [first]
+def test_queued_job_is_canceled_immediately(service: Service, client: httpx2.Client, files: dict[str, Path]) -> None:
+    first, second = (submit(client, files, steps_sos=1_000_000) for _ in range(2))
+    assert client.post(f"/v1/jobs/{second}/cancel").json()["status"] == "canceled"
+    client.post(f"/v1/jobs/{first}/cancel")
+    wait_until(service, client, first, "canceled")
+    page = client.get("/v1/jobs", params={"limit": 1, "status": "canceled"}).json()
+    assert [entry["id"] for entry in page["jobs"]] == [second]
+    following = client.get("/v1/jobs", params={"limit": 1, "status": "canceled", "cursor": page["next_cursor"]})
+    assert [entry["id"] for entry in following.json()["jobs"]] == [first]
 
 
 @pytest.mark.slow
@@ -339,13 +337,12 @@ def test_restart_resumes_running_jobs(files: dict[str, Path], expected: bytes, t
 
 
 @pytest.mark.slow
-def test_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
-    with service.client() as client:
-        job_id = submit(client, files, workers=2, steps_sos=4)
-        ended = wait_until(service, client, job_id, "succeeded", "failed")
-        log = client.get(f"/v1/jobs/{job_id}/artifacts/log.txt").text
-        assert ended["status"] == "succeeded", log
-        assert ended["result"]["steps"] == 4
+def test_job_on_two_ranks(service: Service, client: httpx2.Client, files: dict[str, Path]) -> None:
+    job_id = submit(client, files, workers=2, steps_sos=4)
+    ended = wait_until(service, client, job_id, "succeeded", "failed")
+    log = client.get(f"/v1/jobs/{job_id}/artifacts/log.txt").text
+    assert ended["status"] == "succeeded", log
+    assert ended["result"]["steps"] == 4
 
 
 @pytest.mark.slow
@@ -373,24 +370,25 @@ def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path
 
 
 @pytest.mark.slow
-def test_dry_run_plans_without_queueing_and_its_job_reuses_the_plan(service: Service, files: dict[str, Path]) -> None:
-    with service.client() as client:
-        before = len(client.get("/v1/jobs").json()["jobs"])
-        body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-        data = {"parameters": json.dumps(PARAMETERS | {"steps_sos": 5})}
-        answer = client.post("/v1/jobs", params={"dry_run": True}, files=body, data=data)
-        assert answer.status_code == 200, answer.text
-        plan = answer.json()
-        assert (plan["gaussians"], plan["views"], plan["sh_degree"]) == (616, 3, 1)
-        assert plan["plan"]["decisions"]
-        assert plan["estimated_seconds"] > 0
-        assert plan["memory_bytes"] > 0
-        assert plan["device_memory_bytes"] is None
-        assert len(client.get("/v1/jobs").json()["jobs"]) == before
-        job_id = submit(client, files, steps_sos=5)
-        wait_until(service, client, job_id, "succeeded")
-        reused = client.get(f"/v1/jobs/{job_id}/artifacts/plan.json").json()
-        assert reused["decisions"] == plan["plan"]["decisions"]
+def test_dry_run_plans_without_queueing_and_its_job_reuses_the_plan(
+    service: Service, client: httpx2.Client, files: dict[str, Path]
+) -> None:
+    before = len(client.get("/v1/jobs").json()["jobs"])
+    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+    data = {"parameters": json.dumps(PARAMETERS | {"steps_sos": 5})}
+    answer = client.post("/v1/jobs", params={"dry_run": True}, files=body, data=data)
+    assert answer.status_code == 200, answer.text
+    plan = answer.json()
+    assert (plan["gaussians"], plan["views"], plan["sh_degree"]) == (616, 3, 1)
+    assert plan["plan"]["decisions"]
+    assert plan["estimated_seconds"] > 0
+    assert plan["memory_bytes"] > 0
+    assert plan["device_memory_bytes"] is None
+    assert len(client.get("/v1/jobs").json()["jobs"]) == before
+    job_id = submit(client, files, steps_sos=5)
+    wait_until(service, client, job_id, "succeeded")
+    reused = client.get(f"/v1/jobs/{job_id}/artifacts/plan.json").json()
+    assert reused["decisions"] == plan["plan"]["decisions"]
 
 
 def test_logs_contain_no_errors(service: Service) -> None:

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from api.cli.main import main
+from tests.api.conftest import Sgsst
 from tests.api.service import ROOT
 from tests.small_scenes import wall, write_files
 
@@ -79,17 +80,13 @@ def test_interrupted_result_is_resumed(arguments: list[str], tmp_path: Path, cap
     assert all(entry["complete"] for entry in json.loads((tmp_path / "out" / "batch.json").read_text()).values())
 
 
-def test_missing_scenes_and_foreign_records_are_named(
-    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_scenes_and_foreign_records_are_named(arguments: list[str], tmp_path: Path, sgsst: Sgsst) -> None:
     missing = tmp_path / "missing.ply"
-    assert main(["batch", str(missing), *arguments[3:]]) == 1
-    assert "missing.ply" in capsys.readouterr().err
+    assert "missing.ply" in sgsst(["batch", str(missing), *arguments[3:]], 1)
     record = tmp_path / "out" / "batch.json"
     record.parent.mkdir(exist_ok=True)
     record.write_text("[1]")
-    assert main(arguments) == 2
-    assert "is no record of a batch" in capsys.readouterr().err
+    assert "is no record of a batch" in sgsst(arguments, 2)
     assert record.read_text() == "[1]"
 
 
@@ -102,29 +99,28 @@ def test_missing_scenes_and_foreign_records_are_named(
     ],
 )
 def test_options_of_the_other_place_are_refused(
-    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+    arguments: list[str], tmp_path: Path, sgsst: Sgsst, options: list[str], message: str
 ) -> None:
-    assert main([*arguments, *options]) == 2
-    assert message in capsys.readouterr().err
+    assert message in sgsst([*arguments, *options], 2)
     assert not (tmp_path / "out").exists()
 
 
-def test_results_have_different_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_have_different_names(tmp_path: Path, sgsst: Sgsst) -> None:
     for name in ("a.ply", "a_b.ply", "b_c.png", "c.png"):
         (tmp_path / name).write_bytes(b"neither scene nor image")
     scenes, styles = (
         [str(tmp_path / name) for name in names] for names in (("a.ply", "a_b.ply"), ("b_c.png", "c.png"))
     )
     options = [text for style in styles for text in ("--style", style)]
-    assert main(["batch", *scenes, *options, "--orbit", "3", "--out", str(tmp_path / "out")]) == 1
-    assert "4 of 4 results could not be made: a_b_c, a_c, a_b_b_c, 4_a_b_c" in " ".join(capsys.readouterr().err.split())
+    batch = ["batch", *scenes, *options, "--orbit", "3", "--out", str(tmp_path / "out")]
+    named = "4 of 4 results could not be made: a_b_c, a_c, a_b_b_c, 4_a_b_c"
+    assert named in " ".join(sgsst(batch, 1).split())
 
 
-def test_no_result_replaces_another_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_result_replaces_another_scene(tmp_path: Path, sgsst: Sgsst) -> None:
     ply, _, _ = write_files(tmp_path, wall())
     other = tmp_path / "scene_style.ply"
     other.write_bytes(ply.read_bytes())
     batch = ["batch", str(ply), str(other), "--style", str(tmp_path / "style.png"), "--out", str(tmp_path)]
-    assert main(batch) == 2
-    assert "is the scene of another result, which would be overwritten" in capsys.readouterr().err
+    assert "is the scene of another result, which would be overwritten" in sgsst(batch, 2)
     assert other.read_bytes() == ply.read_bytes()

@@ -17,19 +17,18 @@ from PIL import Image
 from api.cli.main import main
 from api.client import Client
 from api.client.transport import RequestError
+from tests.api.conftest import Sgsst
 from tests.api.service import ROOT, Service
 from tests.full_disk import full_disk
 from tests.http_servers import LocalServer, send
-from tests.small_scenes import wall, write_files
 
 MISSING = "job_1a1fe701a104f943e9d4d8cce5b818c"
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+def files(paths: dict[str, Path]) -> list[str]:
     """Return the arguments of `submit` for a small scene."""
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
-    return [str(ply), "--style", str(style), "--cameras", str(cameras)]
+    return [str(paths["scene"]), "--style", str(paths["style"]), "--cameras", str(paths["cameras"])]
 
 
 @pytest.fixture(autouse=True)
@@ -37,14 +36,15 @@ def url(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SGSST_URL", service.url)
 
 
-def submit(files: list[str], capsys: pytest.CaptureFixture[str], *options: str) -> str:
+def submit(files: list[str], sgsst: Sgsst, *options: str) -> str:
     """Submit a job, and return its id."""
-    assert main(["submit", *files, *options]) == 0
-    return capsys.readouterr().out.strip()
+    return sgsst(["submit", *files, *options]).strip()
 
 
-def test_exit_codes_and_errors_as_json(files: list[str], capsys: pytest.CaptureFixture[str], service: Service) -> None:
-    job_id = submit(files, capsys)
+def test_exit_codes_and_errors_as_json(
+    files: list[str], capsys: pytest.CaptureFixture[str], sgsst: Sgsst, service: Service
+) -> None:
+    job_id = submit(files, sgsst)
     for command, code, kind in (
         (["status", MISSING], 3, "not-found"),
         (["retry", job_id], 4, "conflict"),
@@ -61,43 +61,35 @@ def test_exit_codes_and_errors_as_json(files: list[str], capsys: pytest.CaptureF
         assert content["code"].startswith(kind)
         assert content["detail"]
     assert "Did you mean 'resolution'?" in content["detail"]
-    assert main(["cancel", job_id]) == 0
-    capsys.readouterr()
-    assert main(["watch", job_id]) == 5, "the job did not succeed"
-    capsys.readouterr()
-    assert main(["status", MISSING]) == 3
-    assert capsys.readouterr().err == f"error: There is no job {MISSING}.\n"
+    sgsst(["cancel", job_id])
+    sgsst(["watch", job_id], 5)  # the job did not succeed
+    assert sgsst(["status", MISSING], 3) == f"error: There is no job {MISSING}.\n"
 
 
 def test_job_that_ended_early_says_how_little_was_done(
-    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+    files: list[str], sgsst: Sgsst, service: Service, tmp_path: Path
 ) -> None:
-    job_id = submit(files, capsys)
+    job_id = submit(files, sgsst)
     service.finish(job_id, {"stylized.ply": b"result"}, stopped="within", steps=2, total=60, loss_after=1.94)
-    assert main(["status", job_id]) == 0
-    shown = capsys.readouterr().out
+    shown = sgsst(["status", job_id])
     assert "2 of 60: its time budget was used up (submit it again with a larger `within`" in shown
     assert "(97.0%)" in shown
-    assert main(["watch", job_id]) == 0
-    assert "2 of 60: its time budget was used up" in capsys.readouterr().out
+    assert "2 of 60: its time budget was used up" in sgsst(["watch", job_id])
 
 
-def test_service_that_is_not_there_is_reported_at_once(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_service_that_is_not_there_is_reported_at_once(sgsst: Sgsst, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reads are not retried, so nothing is waited for; the port of a closed socket refuses connections."""
     waits: list[float] = []
     monkeypatch.setattr("api.cli.client_commands._print_retry", lambda details: waits.append(details.wait_for))
     for command in (["status", MISSING], ["jobs"], ["watch", MISSING], ["download", MISSING]):
-        assert main([*command, "--url", "http://127.0.0.1:9"]) == 1
-        assert "cannot be reached" in capsys.readouterr().err
+        assert "cannot be reached" in sgsst([*command, "--url", "http://127.0.0.1:9"], 1)
     assert waits == []
 
 
 def test_interrupted_watch_says_that_the_job_continues(
-    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+    files: list[str], sgsst: Sgsst, service: Service, tmp_path: Path
 ) -> None:
-    job_id = submit(files, capsys)
+    job_id = submit(files, sgsst)
     commands = (["watch", job_id], ["submit", *files, "--out", str(tmp_path / "out.ply")])
     for command in commands:
         process = subprocess.Popen(
@@ -122,7 +114,7 @@ def test_interrupted_watch_says_that_the_job_continues(
 
 
 def test_interrupted_batch_waits_for_its_jobs_again(
-    files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], service: Service
+    files: list[str], tmp_path: Path, sgsst: Sgsst, service: Service
 ) -> None:
     out = tmp_path / "results"
     arguments = ["batch", *files, "--out", str(out), "--workers", "2", "--url", service.url]
@@ -137,32 +129,28 @@ def test_interrupted_batch_waits_for_its_jobs_again(
     job = httpx2.get(f"{service.url}/v1/jobs/{record['scene_style']['job']}").json()
     assert job["parameters"]["workers"] == 2
     service.finish(record["scene_style"]["job"], {"stylized.ply": Path(files[0]).read_bytes()})
-    assert main(arguments) == 0
+    sgsst(arguments)
     assert (out / "scene_style.ply").read_bytes() == Path(files[0]).read_bytes()
     assert Image.open(out / "batch.jpg").width > 100
-    capsys.readouterr()
-    assert main([*arguments[:-1], "http://127.0.0.1:1"]) == 0, "nothing is requested"
-    assert "complete" in capsys.readouterr().out
+    assert "complete" in sgsst([*arguments[:-1], "http://127.0.0.1:1"])
 
 
 def test_download_replaces_no_file_of_another_job(
     files: list[str],
-    capsys: pytest.CaptureFixture[str],
+    sgsst: Sgsst,
     service: Service,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ids = []
     for content in (b"first", b"second"):
-        ids.append(submit(files, capsys))
+        ids.append(submit(files, sgsst))
         service.finish(ids[-1], {"stylized.ply": content})
     monkeypatch.chdir(tmp_path)
     result = tmp_path / "stylized.ply"
     assert main(["download", ids[0]]) == 0
     assert main(["download", ids[0]]) == 0, "the same file again"
-    capsys.readouterr()
-    assert main(["download", ids[1]]) == 2
-    assert "exists, and is not this job's file" in capsys.readouterr().err
+    assert "exists, and is not this job's file" in sgsst(["download", ids[1]], 2)
     assert result.read_bytes() == b"first"
     assert main(["download", ids[1], "--out", "other.ply"]) == 0
     assert main(["download", ids[1], "--overwrite"]) == 0
@@ -173,9 +161,7 @@ def test_download_replaces_no_file_of_another_job(
 @pytest.mark.parametrize(
     "name", ["{outside}", "../outside", "a/../../outside", r"..\outside", r"C:outside", r"\outside"]
 )
-def test_files_outside_of_the_folder_are_refused_before_the_download(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, name: str
-) -> None:
+def test_files_outside_of_the_folder_are_refused_before_the_download(sgsst: Sgsst, tmp_path: Path, name: str) -> None:
     requested = []
     artifacts = [{"name": each, "sha256": ""} for each in ("stylized.ply", name.format(outside=tmp_path / "outside"))]
 
@@ -184,14 +170,14 @@ def test_files_outside_of_the_folder_are_refused_before_the_download(
         send(handler, json.dumps({"artifacts": artifacts}).encode(), Content_Type="application/json")
 
     with LocalServer(answer) as server:
-        assert main(["download", MISSING, "all", "--out", str(tmp_path / "folder"), "--url", server.origin]) == 2
-    assert "which is outside of the download's folder" in " ".join(capsys.readouterr().err.split())
+        said = sgsst(["download", MISSING, "all", "--out", str(tmp_path / "folder"), "--url", server.origin], 2)
+    assert "which is outside of the download's folder" in " ".join(said.split())
     assert requested == [f"/v1/jobs/{MISSING}/artifacts"]
     assert list(tmp_path.iterdir()) == []
 
 
 def test_outputs_are_checked_before_a_job_is_queued(
-    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+    files: list[str], sgsst: Sgsst, service: Service, tmp_path: Path
 ) -> None:
     """Neither the scene nor a file of another kind is overwritten, and nothing fails after the job has ended."""
     before = len(httpx2.get(f"{service.url}/v1/jobs").json()["jobs"])
@@ -202,12 +188,11 @@ def test_outputs_are_checked_before_a_job_is_queued(
         (tmp_path / "out.splat", "does not end in .ply"),
         (tmp_path / "file" / "out.ply", "there is a file of that name"),
     ):
-        assert main(["submit", *files, "--out", str(out)]) == 2
-        assert message in capsys.readouterr().err
+        assert message in sgsst(["submit", *files, "--out", str(out)], 2)
     assert len(httpx2.get(f"{service.url}/v1/jobs").json()["jobs"]) == before
 
 
-def test_names_of_results_are_checked_before_any_request(capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_of_results_are_checked_before_any_request(sgsst: Sgsst) -> None:
     for arguments, message in (
         (["--out", "x.usdz"], "x.usdz: does not end in .ply"),
         (["--out", "x.zip"], "x.zip: does not end in .ply"),
@@ -215,48 +200,39 @@ def test_names_of_results_are_checked_before_any_request(capsys: pytest.CaptureF
         (["--format", "spz", "--out", "x.zip"], "Give a name that ends in .spz"),
         (["report.html", "--out", "x.ply"], "Give a name that ends in .html"),
     ):
-        assert main(["download", MISSING, *arguments, "--url", "http://127.0.0.1:1"]) == 2
-        assert message in " ".join(capsys.readouterr().err.split())
+        assert message in " ".join(sgsst(["download", MISSING, *arguments, "--url", "http://127.0.0.1:1"], 2).split())
 
 
-def test_webhook_events_are_checked_before_files_are_sent(files: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_webhook_events_are_checked_before_files_are_sent(files: list[str], sgsst: Sgsst) -> None:
     for event, message in (("ended", "is not started, progress or completed"), ("started", "requires --webhook")):
-        assert main(["submit", *files, "--webhook-events", event, "--url", "http://127.0.0.1:1"]) == 2
-        assert message in capsys.readouterr().err
+        assert message in sgsst(["submit", *files, "--webhook-events", event, "--url", "http://127.0.0.1:1"], 2)
 
 
-def test_share_prints_the_link(
-    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
-) -> None:
-    job_id = submit(files, capsys)
-    assert main(["share", job_id]) == 4
-    assert "only results can be shared" in capsys.readouterr().err
+def test_share_prints_the_link(files: list[str], sgsst: Sgsst, service: Service, tmp_path: Path) -> None:
+    job_id = submit(files, sgsst)
+    assert "only results can be shared" in sgsst(["share", job_id], 4)
     service.finish(job_id, {"stylized.ply": b"result"})
-    assert main(["share", job_id, "--poster", "--days", "1"]) == 0
-    link = capsys.readouterr().out.strip()
+    link = sgsst(["share", job_id, "--poster", "--days", "1"]).strip()
     assert link.startswith(f"{service.url}/shared/shr_")
     assert httpx2.get(link).status_code == 200
-    assert main(["share", job_id, "--days", "91"]) == 2
-    assert "days" in capsys.readouterr().err
+    assert "days" in sgsst(["share", job_id, "--days", "91"], 2)
 
 
 def test_download_to_a_full_disk_leaves_nothing(
-    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+    files: list[str], sgsst: Sgsst, service: Service, tmp_path: Path
 ) -> None:
-    job_id = submit(files, capsys)
+    job_id = submit(files, sgsst)
     service.finish(job_id, {"stylized.ply": bytes(200_000)})
     out = tmp_path / "new" / "out.ply"
     with full_disk(100_000):
-        assert main(["download", job_id, "--out", str(out)]) == 2
-    assert f"error: {out}: cannot be written: File too large." in capsys.readouterr().err
+        assert f"error: {out}: cannot be written: File too large." in sgsst(["download", job_id, "--out", str(out)], 2)
     assert not out.parent.exists()
 
 
 @pytest.mark.parametrize("job_id", ["", "?", ".", "..", "a/b", "a b#c"])
 @pytest.mark.parametrize("command", ["status", "watch", "download", "cancel", "delete"])
-def test_id_that_no_job_has_is_refused(command: str, job_id: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, job_id]) == 3
-    assert capsys.readouterr().err == f"error: There is no job {job_id!r}. `sgsst jobs` lists the IDs of jobs.\n"
+def test_id_that_no_job_has_is_refused(command: str, job_id: str, sgsst: Sgsst) -> None:
+    assert sgsst([command, job_id], 3) == f"error: There is no job {job_id!r}. `sgsst jobs` lists the IDs of jobs.\n"
 
 
 @pytest.mark.parametrize(
@@ -271,11 +247,8 @@ def test_id_that_no_job_has_is_refused(command: str, job_id: str, capsys: pytest
         ("--key", "a\nb", "Copy it again"),
     ],
 )
-def test_address_or_key_that_cannot_be_used_is_refused(
-    option: str, value: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["jobs", option, value]) == 2
-    assert message in capsys.readouterr().err
+def test_address_or_key_that_cannot_be_used_is_refused(option: str, value: str, message: str, sgsst: Sgsst) -> None:
+    assert message in sgsst(["jobs", option, value], 2)
 
 
 @pytest.mark.parametrize(
@@ -308,17 +281,13 @@ def test_environment_that_cannot_be_used_is_reported(
         Client()
 
 
-def test_proxy_is_named_if_the_service_cannot_be_reached(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_proxy_is_named_if_the_service_cannot_be_reached(sgsst: Sgsst, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("http_proxy", "http://user:secret@127.0.0.1:9")
-    assert main(["jobs", "--url", "http://service.example"]) == 1
-    shown = capsys.readouterr().err
+    shown = sgsst(["jobs", "--url", "http://service.example"], 1)
     assert "cannot be reached through the proxy http://127.0.0.1:9 (NO_PROXY excludes hosts)" in shown
     assert "secret" not in shown
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    assert main(["jobs", "--url", "http://127.0.0.1:9"]) == 1
-    assert "proxy" not in capsys.readouterr().err
+    assert "proxy" not in sgsst(["jobs", "--url", "http://127.0.0.1:9"], 1)
 
 
 EVIL = "\x1b]0;title\x07\x1b[2J\x9b2J\u202e[/red]"
@@ -370,10 +339,11 @@ def answer_as_a_stranger(handler: BaseHTTPRequestHandler) -> None:
         send(handler, b"<html>", Content_Type="text/html")
 
 
-def test_address_of_another_program_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
+def test_address_of_another_program_is_reported(sgsst: Sgsst) -> None:
     with LocalServer(answer_as_a_stranger) as server:
         for path, what in (("", "it sends text/html"), ("/moved", "it redirects to https://new.example/")):
             for command in (["status", MISSING], ["jobs"], ["download", MISSING]):
-                assert main([*command, "--url", server.origin + path]) == 1
-                assert f"does not answer like the service: {what}. Check the address." in capsys.readouterr().err
+                assert f"does not answer like the service: {what}. Check the address." in sgsst(
+                    [*command, "--url", server.origin + path], 1
+                )
         server.shutdown()

@@ -10,6 +10,7 @@ import pytest
 
 from api.cli.main import main
 from service.settings import start
+from tests.api.conftest import Sgsst
 from tests.api.service import ROOT
 from tests.full_disk import full_disk
 from tests.small_scenes import wall, write_files
@@ -126,10 +127,9 @@ def test_full_standard_output_is_one_message() -> None:
 @pytest.mark.parametrize(
     "option", ["--render-mode", "--preset", "--precision", "--up", "--spz-axes", "--style-loss", "--unseen"]
 )
-def test_unknown_words_are_refused_with_the_valid_ones(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_words_are_refused_with_the_valid_ones(option: str, sgsst: Sgsst) -> None:
     command = ["stylize", "scene.ply", "--style", "style.png", "--out", "out.ply", option, "foo"]
-    assert main(command) == 2
-    assert f"Invalid value for '{option}': 'foo' is not one of '" in capsys.readouterr().err
+    assert f"Invalid value for '{option}': 'foo' is not one of '" in sgsst(command, 2)
 
 
 @pytest.mark.parametrize(
@@ -147,13 +147,12 @@ def test_unknown_words_are_refused_with_the_valid_ones(option: str, capsys: pyte
     ],
 )
 def test_settings_that_cannot_be_used_are_named(
-    name: str, value: str, wrong: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, value: str, wrong: str, monkeypatch: pytest.MonkeyPatch, sgsst: Sgsst
 ) -> None:
     if "psycopg" in value:
         pytest.importorskip("psycopg")
     monkeypatch.setenv(f"SGSST_{name}", value)
-    assert main(["keys", "list"]) == 2
-    message = capsys.readouterr().err
+    message = sgsst(["keys", "list"], 2)
     assert message.startswith(f"error: Environment variable SGSST_{name}"), message
     assert wrong in message
     assert "secret" not in message

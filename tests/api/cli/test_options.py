@@ -10,11 +10,12 @@ import typer
 from annotated_types import Ge, Gt, Le
 from pydantic import ValidationError
 
-from api.cli.main import app, main
+from api.cli.main import app
 from api.cli.options import flags, help_text, reference
 from service.inputs import JobParameters
 from sgsst_core.errors import SettingsError
 from sgsst_core.settings import Declared, Settings, checked, declared, make_settings, parse_seconds, parse_strength
+from tests.api.conftest import Sgsst
 from worker.job import SceneRequest
 from worker.options import GROUPS, RunOptions, StylizeOptions, ViewOptions
 
@@ -59,9 +60,8 @@ def test_commands_and_parameters_offer_every_option() -> None:
 
 
 @pytest.mark.parametrize("command", ["stylize", "submit", "plan", "check"])
-def test_help_has_the_groups_of_the_page(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == 0
-    parts = re.split(r"^(\w+):\n", capsys.readouterr().out, flags=re.MULTILINE)
+def test_help_has_the_groups_of_the_page(command: str, sgsst: Sgsst) -> None:
+    parts = re.split(r"^(\w+):\n", sgsst([command, "--help"]), flags=re.MULTILINE)
     groups = {
         title: [name.replace("-", "_") for name in re.findall(r"^  (?:-h, )?--([\w-]+)", text, flags=re.MULTILINE)]
         for title, text in zip(parts[1::2], parts[2::2], strict=True)
@@ -95,7 +95,7 @@ BEYOND = [(name, value) for name, option in OPTIONS.items() for value in outside
 
 
 @pytest.mark.parametrize(("name", "value"), BEYOND)
-def test_bounds_match_across_interfaces(name: str, value: float, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bounds_match_across_interfaces(name: str, value: float, sgsst: Sgsst) -> None:
     with pytest.raises(ValidationError) as refused:
         JobParameters.model_validate({name: value})
     error = refused.value.errors()[0]  # a second one lists the words that may replace a number
@@ -108,22 +108,20 @@ def test_bounds_match_across_interfaces(name: str, value: float, capsys: pytest.
     if name == "memory_limit":  # its command-line format has no digits for these
         return
     for command in ("stylize", "submit"):
-        assert main([command, "scene.ply", "--style", "x.png", "--out", "x.ply", flags(OPTIONS[name]), str(value)]) == 2
-        said = capsys.readouterr().err
+        said = sgsst([command, "scene.ply", "--style", "x.png", "--out", "x.ply", flags(OPTIONS[name]), str(value)], 2)
         assert flags(OPTIONS[name]) in said
         assert error["msg"] in said
 
 
-def test_orbit_that_is_no_number_is_refused_with_the_word(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", "--orbit", "many"]) == 2
-    assert capsys.readouterr().err.endswith("unable to parse string as an integer, or 'auto'.\n")
+def test_orbit_that_is_no_number_is_refused_with_the_word(sgsst: Sgsst) -> None:
+    command = ["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", "--orbit", "many"]
+    assert sgsst(command, 2).endswith("unable to parse string as an integer, or 'auto'.\n")
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "many", ""])
-def test_non_finite_numbers_are_rejected(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_non_finite_numbers_are_rejected(value: str, sgsst: Sgsst) -> None:
     for flag in ("--near", "--within", "--workers"):
-        assert main(["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", flag, value]) == 2
-        assert flag in capsys.readouterr().err
+        assert flag in sgsst(["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", flag, value], 2)
 
 
 def test_options_reference_is_up_to_date() -> None:

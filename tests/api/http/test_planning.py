@@ -39,60 +39,55 @@ def events(client: httpx2.Client, files: dict[str, bytes], **parameters: Any) ->
 
 
 @pytest.mark.slow
-def test_events_report_views_and_same_plan(service: Service, files: dict[str, bytes]) -> None:
-    with service.client() as client:
-        before = jobs(client)
-        *planning, last = events(client, files)
-        assert {sent.event for sent in planning} == {"planning"}
-        now = [json.loads(sent.data) for sent in planning]
-        assert {entry["stage"] for entry in now} == {"planning"}
-        assert [entry["total"] for entry in now] == [3] * len(now)
-        assert [entry["step"] for entry in now] == sorted(entry["step"] for entry in now)
-        assert (now[-1]["step"], now[-1]["fraction"]) == (3, 1.0)
-        assert last.event == "plan"
-        plain = client.post("/v1/jobs", **request(files))
-        assert plain.headers["content-type"] == "application/json"
-        assert plain.json() == json.loads(last.data)
-        assert jobs(client) == before
+def test_events_report_views_and_same_plan(client: httpx2.Client, files: dict[str, bytes]) -> None:
+    before = jobs(client)
+    *planning, last = events(client, files)
+    assert {sent.event for sent in planning} == {"planning"}
+    now = [json.loads(sent.data) for sent in planning]
+    assert {entry["stage"] for entry in now} == {"planning"}
+    assert [entry["total"] for entry in now] == [3] * len(now)
+    assert [entry["step"] for entry in now] == sorted(entry["step"] for entry in now)
+    assert (now[-1]["step"], now[-1]["fraction"]) == (3, 1.0)
+    assert last.event == "plan"
+    plain = client.post("/v1/jobs", **request(files))
+    assert plain.headers["content-type"] == "application/json"
+    assert plain.json() == json.loads(last.data)
+    assert jobs(client) == before
 
 
-def test_estimate_covers_the_whole_job(service: Service, files: dict[str, bytes]) -> None:
-    with service.client() as client:
-        plan = client.post("/v1/jobs", **request(files)).json()
-        assert plan["warnings"] == []
-        expected = plan["plan"]["prediction"]
-        assert plan["total_seconds"] > expected["job"] + expected["ending"] > plan["estimated_seconds"] > 0
-        limited = client.post("/v1/jobs", **request(files, within=0.001)).json()
-        (chosen,) = (each for each in limited["plan"]["decisions"] if each["item"] == "time budget")
-        assert chosen["decision"].endswith(" 1 step")
-        assert limited["pixels"] < plan["pixels"], "those of the chosen views"
+def test_estimate_covers_the_whole_job(client: httpx2.Client, files: dict[str, bytes]) -> None:
+    plan = client.post("/v1/jobs", **request(files)).json()
+    assert plan["warnings"] == []
+    expected = plan["plan"]["prediction"]
+    assert plan["total_seconds"] > expected["job"] + expected["ending"] > plan["estimated_seconds"] > 0
+    limited = client.post("/v1/jobs", **request(files, within=0.001)).json()
+    (chosen,) = (each for each in limited["plan"]["decisions"] if each["item"] == "time budget")
+    assert chosen["decision"].endswith(" 1 step")
+    assert limited["pixels"] < plan["pixels"], "those of the chosen views"
 
 
-def test_views_and_regions_without_gaussians_are_warned_about(service: Service, files: dict[str, bytes]) -> None:
+def test_views_and_regions_without_gaussians_are_warned_about(client: httpx2.Client, files: dict[str, bytes]) -> None:
     aside = json.loads(files["cameras"])
     aside[0]["position"] = [0, 0, 99]
     regions = [{"name": "empty", "select": "half-space=0,0,-1,-99"}, {"name": "all", "select": "half-space=0,0,1,-99"}]
-    with service.client() as client:
-        sent = request({**files, "cameras": json.dumps(aside).encode()}, regions=regions)
-        warnings = client.post("/v1/jobs", **sent).json()["warnings"]
-        assert "views: 1 of 3 are skipped: they see no Gaussian" in warnings
-        assert any(text.startswith("region empty: ignored, because it has no Gaussians") for text in warnings)
-        assert len(warnings) == 2
+    sent = request({**files, "cameras": json.dumps(aside).encode()}, regions=regions)
+    warnings = client.post("/v1/jobs", **sent).json()["warnings"]
+    assert "views: 1 of 3 are skipped: they see no Gaussian" in warnings
+    assert any(text.startswith("region empty: ignored, because it has no Gaussians") for text in warnings)
+    assert len(warnings) == 2
 
 
-def test_unusable_files_are_rejected_before_first_event(service: Service, files: dict[str, bytes]) -> None:
-    with service.client() as client:
-        headers = {"Accept": "text/event-stream"}
-        refused(client.post("/v1/jobs", headers=headers, **request({**files, "scene": b"none"})), 422, "invalid-scene")
+def test_unusable_files_are_rejected_before_first_event(client: httpx2.Client, files: dict[str, bytes]) -> None:
+    headers = {"Accept": "text/event-stream"}
+    refused(client.post("/v1/jobs", headers=headers, **request({**files, "scene": b"none"})), 422, "invalid-scene")
 
 
-def test_planning_errors_are_events(service: Service, files: dict[str, bytes]) -> None:
-    with service.client() as client:
-        last = events(client, files, regions=[IN_VIEW])[-1]
-        problem = json.loads(last.data)
-        assert (last.event, problem["status"], problem["code"]) == ("problem", 422, "invalid-settings")
-        plain = client.post("/v1/jobs", **request(files, regions=[IN_VIEW]))
-        assert (plain.status_code, plain.json()) == (422, problem)
+def test_planning_errors_are_events(client: httpx2.Client, files: dict[str, bytes]) -> None:
+    last = events(client, files, regions=[IN_VIEW])[-1]
+    problem = json.loads(last.data)
+    assert (last.event, problem["status"], problem["code"]) == ("problem", 422, "invalid-settings")
+    plain = client.post("/v1/jobs", **request(files, regions=[IN_VIEW]))
+    assert (plain.status_code, plain.json()) == (422, problem)
 
 
 def blender(**lens: Any) -> bytes:
@@ -116,104 +111,97 @@ def photo(name: str) -> tuple[str, tuple[str, bytes]]:
 
 
 @pytest.mark.slow
-def test_plan_lists_camera_and_photo_decisions(service: Service, files: dict[str, bytes]) -> None:
-    with service.client() as client:
-        asked = request({**files, "cameras": blender(k1=0.1)})
-        problem = refused(client.post("/v1/jobs", **asked), 422, "invalid-cameras")
-        assert "gives no size. Add the sizes" in problem["detail"]
-        asked["files"] += [photo("train/view_0.png"), photo("train/view_2.png")]
-        answer = client.post("/v1/jobs", **asked)
-        assert answer.status_code == 200, answer.text
-        lines = [f"{line['item']}: {line['decision']}" for line in answer.json()["plan"]["decisions"]]
-        assert "lenses: the photos are undistorted" in lines
-        assert "photos: warning: 1 of 3 views are left out" in lines
-        assert any(text.startswith("photos: 1 of 3 views are left out: ") for text in answer.json()["warnings"])
-        assert answer.json()["views"] == 2
+def test_plan_lists_camera_and_photo_decisions(client: httpx2.Client, files: dict[str, bytes]) -> None:
+    asked = request({**files, "cameras": blender(k1=0.1)})
+    problem = refused(client.post("/v1/jobs", **asked), 422, "invalid-cameras")
+    assert "gives no size. Add the sizes" in problem["detail"]
+    asked["files"] += [photo("train/view_0.png"), photo("train/view_2.png")]
+    answer = client.post("/v1/jobs", **asked)
+    assert answer.status_code == 200, answer.text
+    lines = [f"{line['item']}: {line['decision']}" for line in answer.json()["plan"]["decisions"]]
+    assert "lenses: the photos are undistorted" in lines
+    assert "photos: warning: 1 of 3 views are left out" in lines
+    assert any(text.startswith("photos: 1 of 3 views are left out: ") for text in answer.json()["warnings"])
+    assert answer.json()["views"] == 2
 
 
 @pytest.mark.slow
-def test_panoramas_are_planned_as_the_faces_that_show_something(service: Service, files: dict[str, bytes]) -> None:
+def test_panoramas_are_planned_as_the_faces_that_show_something(client: httpx2.Client, files: dict[str, bytes]) -> None:
     """The pinhole, the front faces and a side face of each panorama see the scene, a wall before the cameras."""
     content = json.loads(blender(w=256, h=128))
     for index in (0, 2):
         content["frames"][index]["camera_model"] = "EQUIRECTANGULAR"
-    with service.client() as client:
-        answer = client.post("/v1/jobs", **request({**files, "cameras": json.dumps(content).encode()}))
-        assert answer.status_code == 200, answer.text
-        assert answer.json()["views"] == 13
-        lines = [f"{line['item']}: {line['decision']}: {line['reason']}" for line in answer.json()["plan"]["decisions"]]
-        assert any(line.startswith("cameras: 2 of 3 are panoramas, six views each: ") for line in lines)
-        assert "views: 8 of 13 are skipped: they see no Gaussian" in lines
+    answer = client.post("/v1/jobs", **request({**files, "cameras": json.dumps(content).encode()}))
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["views"] == 13
+    lines = [f"{line['item']}: {line['decision']}: {line['reason']}" for line in answer.json()["plan"]["decisions"]]
+    assert any(line.startswith("cameras: 2 of 3 are panoramas, six views each: ") for line in lines)
+    assert "views: 8 of 13 are skipped: they see no Gaussian" in lines
 
 
-def test_mismatched_cameras_are_rejected_immediately(service: Service, files: dict[str, bytes]) -> None:
+def test_mismatched_cameras_are_rejected_immediately(client: httpx2.Client, files: dict[str, bytes]) -> None:
     stereo = blender(camera_model="VR180_L", w=64, h=32)
-    with service.client() as client:
-        for name, content, detail in (
-            ("transforms.json", stereo, "which is neither a pinhole with a lens nor a 360-degree panorama"),
-            ("cameras.xml", b"<?xml version='1.0'?>", "It may be cameras of Metashape."),
-            ("reconstruction.json", b'[{"cameras": {}, "shots": {}}]', "export_colmap"),
-        ):
-            asked = request(files)
-            asked["files"][1] = ("cameras", (name, content))
-            assert detail in refused(client.post("/v1/jobs", **asked), 422, "invalid-cameras")["detail"]
+    for name, content, detail in (
+        ("transforms.json", stereo, "which is neither a pinhole with a lens nor a 360-degree panorama"),
+        ("cameras.xml", b"<?xml version='1.0'?>", "It may be cameras of Metashape."),
+        ("reconstruction.json", b'[{"cameras": {}, "shots": {}}]', "export_colmap"),
+    ):
+        asked = request(files)
+        asked["files"][1] = ("cameras", (name, content))
+        assert detail in refused(client.post("/v1/jobs", **asked), 422, "invalid-cameras")["detail"]
 
 
 @pytest.mark.slow
-def test_disconnect_cancels_planning(service: Service, files: dict[str, bytes]) -> None:
+def test_disconnect_cancels_planning(service: Service, client: httpx2.Client, files: dict[str, bytes]) -> None:
     """A thousand views take several times as long to plan as a client takes to disconnect at the first event."""
     views = json.loads(files["cameras"])
     many = [{**views[index % len(views)], "img_name": f"view_{index}"} for index in range(1000)]
     long = request({**files, "cameras": json.dumps(many).encode()}, resolution=1024, seed=1)
-    with service.client() as client:
-        events(client, files)
-        both = len(service.processes("service.inspection.process"))
-        with client.sse("/v1/jobs", method="POST", **long) as source:
-            next(iter(source))
-        wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")
-        assert events(client, files, resolution=96)[-1].event == "plan"
+    events(client, files)
+    both = len(service.processes("service.inspection.process"))
+    with client.sse("/v1/jobs", method="POST", **long) as source:
+        next(iter(source))
+    wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")
+    assert events(client, files, resolution=96)[-1].event == "plan"
 
 
-def test_plan_of_an_orbit_says_whether_up_is_sure(service: Service, files: dict[str, bytes]) -> None:
+def test_plan_of_an_orbit_says_whether_up_is_sure(client: httpx2.Client, files: dict[str, bytes]) -> None:
     without = {role: content for role, content in files.items() if role != "cameras"}
-    with service.client() as client:
-        before = jobs(client)
-        asked = client.post("/v1/jobs", **request(without, orbit=2)).json()["up"]
-        assert (asked["sure"], len(asked["candidates"])) == (False, 2)
-        assert asked["candidates"][0] == "-y"
-        assert "most captures" in asked["reason"]
-        answer = client.post("/v1/jobs", **request(without) | {"params": {"sure_up": True}})  # an orbit by default
-        assert refused(answer, 422, "unsure-up")["candidates"] == asked["candidates"]
-        assert jobs(client) == before
-        given = client.post("/v1/jobs", **request(without, orbit=2, up="z")).json()["up"]
-        assert given == {"direction": "z", "sure": True, "candidates": ["z"], "reason": "requested"}
-        assert client.post("/v1/jobs", **request(files)).json()["up"] is None
+    before = jobs(client)
+    asked = client.post("/v1/jobs", **request(without, orbit=2)).json()["up"]
+    assert (asked["sure"], len(asked["candidates"])) == (False, 2)
+    assert asked["candidates"][0] == "-y"
+    assert "most captures" in asked["reason"]
+    answer = client.post("/v1/jobs", **request(without) | {"params": {"sure_up": True}})  # an orbit by default
+    assert refused(answer, 422, "unsure-up")["candidates"] == asked["candidates"]
+    assert jobs(client) == before
+    given = client.post("/v1/jobs", **request(without, orbit=2, up="z")).json()["up"]
+    assert given == {"direction": "z", "sure": True, "candidates": ["z"], "reason": "requested"}
+    assert client.post("/v1/jobs", **request(files)).json()["up"] is None
 
 
-def test_cameras_that_hardly_show_the_scene_are_refused_if_asked(service: Service, files: dict[str, bytes]) -> None:
+def test_cameras_that_hardly_show_the_scene_are_refused_if_asked(
+    client: httpx2.Client, files: dict[str, bytes]
+) -> None:
     views = json.loads(files["cameras"])
     for view in views:
         view["position"][0] += 3.2  # the wall ends at 2.4
     foreign = {**files, "cameras": json.dumps(views).encode()}
-    with service.client() as client:
-        before = jobs(client)
-        refused = client.post("/v1/jobs", **request(foreign) | {"params": {"sure_up": True}})
-        assert (refused.status_code, refused.json()["code"], refused.json()["input"]) == (
-            422,
-            "unsure-cameras",
-            "cameras",
-        )
-        assert "of the Gaussians in its frame" in refused.json()["detail"]
-        assert jobs(client) == before
+    before = jobs(client)
+    refused = client.post("/v1/jobs", **request(foreign) | {"params": {"sure_up": True}})
+    assert (refused.status_code, refused.json()["code"], refused.json()["input"]) == (
+        422,
+        "unsure-cameras",
+        "cameras",
+    )
+    assert "of the Gaussians in its frame" in refused.json()["detail"]
+    assert jobs(client) == before
 
 
-def test_orbit_surrounds_what_a_crop_leaves(service: Service, files: dict[str, bytes]) -> None:
+def test_orbit_surrounds_what_a_crop_leaves(client: httpx2.Client, files: dict[str, bytes]) -> None:
     without = {role: content for role, content in files.items() if role != "cameras"}
     crop = [{"name": "inside", "select": "box=-1,-1,2,0,0,4"}, {"name": "rest", "freeze": True}]
-    with service.client() as client:
-        plans = [
-            client.post("/v1/jobs", **request(without, orbit=2, **more)).json() for more in ({}, {"regions": crop})
-        ]
+    plans = [client.post("/v1/jobs", **request(without, orbit=2, **more)).json() for more in ({}, {"regions": crop})]
     whole, cropped = (
         next(each["decision"] for each in plan["plan"]["decisions"] if each["item"] == "cameras") for plan in plans
     )

@@ -12,13 +12,13 @@ from typing import Any
 import httpx2
 import pytest
 
-from api.cli.main import main
 from api.http.context import Rates
 from service import problems
 from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import open_store
 from service.store.keys import NO_QUOTAS, Quotas
+from tests.api.conftest import Sgsst
 from tests.api.http.test_api import TUS, form, refused
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.postgres import fresh_database, is_installed, server
@@ -101,7 +101,7 @@ def test_quotas_of_jobs_bytes_and_requests(service: Service, files: dict[str, by
 
 
 def test_usage_of_own_key_and_of_all_keys(
-    service: Service, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    service: Service, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, sgsst: Sgsst
 ) -> None:
     used = {}
     for _ in range(2):
@@ -123,18 +123,14 @@ def test_usage_of_own_key_and_of_all_keys(
         refused(client.get("/v1/usage"), 401, "unauthorized")
     for name in ("SGSST_DATA", "SGSST_KEY", "SGSST_URL"):
         monkeypatch.setenv(name, "")
-    assert main(["keys", "create", "operator", "--operator", "--data", str(service.data)]) == 0
-    operators = capsys.readouterr().out.strip()
+    operators = sgsst(["keys", "create", "operator", "--operator", "--data", str(service.data)]).strip()
     for command in (["--data", str(service.data)], ["--url", service.url, "--key", operators]):
-        assert main(["usage", "--json", *command]) == 0
-        rows = json.loads(capsys.readouterr().out)
+        rows = json.loads(sgsst(["usage", "--json", *command]))
         assert {row["key"]: row for row in rows}.items() >= {
             owner: {"day": rows[-1]["day"], **row} for owner, row in used.items()
         }.items()
-        assert main(["usage", *command]) == 0
-        assert next(iter(used)) in capsys.readouterr().out
-        assert main(["usage", "--since", "monday", *command]) == 2
-        assert "2026-11-21" in capsys.readouterr().err
+        assert next(iter(used)) in sgsst(["usage", *command])
+        assert "2026-11-21" in sgsst(["usage", "--since", "monday", *command], 2)
 
 
 def test_connections_are_limited(service: Service) -> None:

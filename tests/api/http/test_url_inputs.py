@@ -17,7 +17,6 @@ from typing import Any
 import httpx2
 import pytest
 
-from api.cli.main import main
 from api.http.receiving import Fetcher, Receipt, Receipts, file_name
 from service import outgoing, problems
 from service.deadlines import FileThreads
@@ -28,6 +27,7 @@ from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.keys import Quotas
+from tests.api.conftest import Sgsst
 from tests.api.http.sending import refused
 from tests.api.service import Service
 from tests.http_servers import Answer, LocalServer, send
@@ -448,47 +448,43 @@ def urls(tmp_path_factory: pytest.TempPathFactory, shared_files: FileServer) -> 
     }
 
 
-def test_job_from_urls(service: Service, shared_files: FileServer, urls: dict[str, str]) -> None:
+def test_job_from_urls(client: httpx2.Client, shared_files: FileServer, urls: dict[str, str]) -> None:
     """JSON and forms may name URLs. The inputs have the names and the digests of the files."""
     named = {"scene": urls["scene"], "style": urls["style"], "cameras": [urls["cameras"]]}
-    with service.client() as client:
-        by_json = client.post("/v1/jobs", json=named)
-        by_form = client.post("/v1/jobs", data=urls, files=[("webhook", (None, ""))])
-        for answer in (by_json, by_form):
-            assert answer.status_code == 202, answer.text
-            job = answer.json()
-            assert {entry["role"]: entry["name"] for entry in job["inputs"]} == {
-                role: url.rsplit("/", 1)[1] for role, url in urls.items()
-            }
-            for entry in job["inputs"]:
-                role = entry["role"]
-                content = client.get(f"/v1/jobs/{job['id']}/inputs/{role}").content
-                assert content == httpx2.get(urls[role]).content
-                assert hashlib.sha256(content).hexdigest() == entry["sha256"]
+    by_json = client.post("/v1/jobs", json=named)
+    by_form = client.post("/v1/jobs", data=urls, files=[("webhook", (None, ""))])
+    for answer in (by_json, by_form):
+        assert answer.status_code == 202, answer.text
+        job = answer.json()
+        assert {entry["role"]: entry["name"] for entry in job["inputs"]} == {
+            role: url.rsplit("/", 1)[1] for role, url in urls.items()
+        }
+        for entry in job["inputs"]:
+            role = entry["role"]
+            content = client.get(f"/v1/jobs/{job['id']}/inputs/{role}").content
+            assert content == httpx2.get(urls[role]).content
+            assert hashlib.sha256(content).hexdigest() == entry["sha256"]
 
 
-def test_submit_command_accepts_urls(
-    service: Service, urls: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_submit_command_accepts_urls(service: Service, urls: dict[str, str], tmp_path: Path, sgsst: Sgsst) -> None:
     style = tmp_path / "local.png"
     style.write_bytes(httpx2.get(urls["style"]).content)
     command = ["submit", urls["scene"], "--cameras", urls["cameras"], "--url", service.url, "--json"]
     command += ["--style", f"{urls['style']}:2", "--style", str(style), "--region", "half:half-space=1,0,0,0"]
-    assert main([*command, "--region-style", f"half={style}"]) == 0
-    job = json.loads(capsys.readouterr().out)
+    job = json.loads(sgsst([*command, "--region-style", f"half={style}"]))
     assert job["parameters"]["style_weights"] == [2, 1]
     assert job["parameters"]["regions"][0]["style"] == ["2_local.png:1.0"]
     names = {role: [entry["name"] for entry in job["inputs"] if entry["role"] == role] for role in urls}
     styles = ["style.png", "local.png", "2_local.png"]
     assert names == {"scene": ["scene.ply"], "cameras": ["cameras.json"], "style": styles}
-    assert main([*command, "--region-style", f"half={urls['style']}"]) == 2
-    assert "cannot be a URL. Download the image" in capsys.readouterr().err
-    assert main(["submit", "http://evil.test/scene.ply", "--style", str(style), "--orbit=3", "--url", service.url]) == 2
-    assert "not among the hosts" in capsys.readouterr().err
+    assert "cannot be a URL. Download the image" in sgsst([*command, "--region-style", f"half={urls['style']}"], 2)
+    assert "not among the hosts" in sgsst(
+        ["submit", "http://evil.test/scene.ply", "--style", str(style), "--orbit=3", "--url", service.url], 2
+    )
 
 
 def test_requests_are_checked_before_anything_is_fetched(
-    service: Service, shared_files: FileServer, urls: dict[str, str]
+    client: httpx2.Client, shared_files: FileServer, urls: dict[str, str]
 ) -> None:
     wrong: list[tuple[str, dict[str, Any]]] = [
         ("invalid-cameras", {"scene": urls["scene"], "style": urls["style"], "photos": [urls["style"]]}),
@@ -498,13 +494,14 @@ def test_requests_are_checked_before_anything_is_fetched(
         ("invalid-request", {**urls, "cameras": [urls["cameras"]], "parameters": {"seed": -1}}),
     ]
     before = len(shared_files.requests)
-    with service.client() as client:
-        for code, body in wrong:
-            refused(client.post("/v1/jobs", json=body), 422, code)
+    for code, body in wrong:
+        refused(client.post("/v1/jobs", json=body), 422, code)
     assert len(shared_files.requests) == before
 
 
-def test_failures_are_problem_documents(service: Service, shared_files: FileServer, urls: dict[str, str]) -> None:
+def test_failures_are_problem_documents(
+    service: Service, client: httpx2.Client, shared_files: FileServer, urls: dict[str, str]
+) -> None:
     """The style is missing, no image, or no file that may be fetched; nothing stays of the fetched scene."""
     bad = {
         "url-not-fetched": sends(b"", 404),
@@ -513,10 +510,9 @@ def test_failures_are_problem_documents(service: Service, shared_files: FileServ
     }
     stored = sorted((service.data / "blobs").glob("*/*"))
     scene = shared_files.url("/other.ply", sends(httpx2.get(urls["scene"]).content + b"\n"))
-    with service.client() as client:
-        for code, answer in bad.items():
-            body = {"scene": scene, "style": shared_files.url("/bad", answer), "cameras": [urls["cameras"]]}
-            refused(client.post("/v1/jobs", json=body), 422, code)
+    for code, answer in bad.items():
+        body = {"scene": scene, "style": shared_files.url("/bad", answer), "cameras": [urls["cameras"]]}
+        refused(client.post("/v1/jobs", json=body), 422, code)
     assert list((service.data / "incoming").iterdir()) == []
     assert sorted((service.data / "blobs").glob("*/*")) == stored
 

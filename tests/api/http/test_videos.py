@@ -53,22 +53,21 @@ def names(client: httpx2.Client, job_id: str) -> list[str]:
 
 
 @pytest.mark.parametrize("path", ["orbit", "cameras"])
-def test_finished_job_makes_another_video_with_progress(service: Service, job: str, path: str) -> None:
-    with service.client() as client:
-        *rendering, last = events(client, job, path=path, fps=4, seconds=2, resolution=100)
-        assert {sent.event for sent in rendering} == {"rendering"}
-        assert [json.loads(sent.data)["total"] for sent in rendering] == [8] * len(rendering)
-        assert json.loads(rendering[-1].data)["fraction"] == 1
-        assert last.event == "video", last.data
-        assert json.loads(last.data)["name"] == "video.mp4"
-        images = frames(client, job)
-        assert len(images) == 8
-        assert max(images[0].shape) == 100
-        assert names(client, job).count("video.mp4") == 1
-        ranged = client.get(f"/v1/jobs/{job}/artifacts/video.mp4", headers={"Range": "bytes=4-7"})
-        assert (ranged.status_code, ranged.content) == (206, b"ftyp")
-        again = client.post(f"/v1/jobs/{job}/video", json={"seconds": 0.1})
-        assert (again.status_code, again.json()["media_type"]) == (200, "video/mp4")
+def test_finished_job_makes_another_video_with_progress(client: httpx2.Client, job: str, path: str) -> None:
+    *rendering, last = events(client, job, path=path, fps=4, seconds=2, resolution=100)
+    assert {sent.event for sent in rendering} == {"rendering"}
+    assert [json.loads(sent.data)["total"] for sent in rendering] == [8] * len(rendering)
+    assert json.loads(rendering[-1].data)["fraction"] == 1
+    assert last.event == "video", last.data
+    assert json.loads(last.data)["name"] == "video.mp4"
+    images = frames(client, job)
+    assert len(images) == 8
+    assert max(images[0].shape) == 100
+    assert names(client, job).count("video.mp4") == 1
+    ranged = client.get(f"/v1/jobs/{job}/artifacts/video.mp4", headers={"Range": "bytes=4-7"})
+    assert (ranged.status_code, ranged.content) == (206, b"ftyp")
+    again = client.post(f"/v1/jobs/{job}/video", json={"seconds": 0.1})
+    assert (again.status_code, again.json()["media_type"]) == (200, "video/mp4")
 
 
 def test_client_makes_a_video(service: Service, job: str) -> None:
@@ -83,16 +82,15 @@ def test_client_makes_a_video(service: Service, job: str) -> None:
         assert len(frames(client, job)) == 3
 
 
-def test_video_that_nobody_waits_for_is_completed(service: Service, job: str) -> None:
-    with service.client() as client:
-        before = client.get(f"/v1/jobs/{job}/artifacts").json()
-        options = {"fps": 10, "seconds": 6, "resolution": 200}
-        with client.sse(f"/v1/jobs/{job}/video", method="POST", json=options) as source:
-            next(iter(source))
-            other = client.post(f"/v1/jobs/{job}/video", json={"seconds": 1})
-            assert (other.status_code, other.json()["code"]) == (503, "busy")
-        wait_for(lambda: client.get(f"/v1/jobs/{job}/artifacts").json() != before, "the video to be published")
-        assert len(frames(client, job)) == 60
+def test_video_that_nobody_waits_for_is_completed(client: httpx2.Client, job: str) -> None:
+    before = client.get(f"/v1/jobs/{job}/artifacts").json()
+    options = {"fps": 10, "seconds": 6, "resolution": 200}
+    with client.sse(f"/v1/jobs/{job}/video", method="POST", json=options) as source:
+        next(iter(source))
+        other = client.post(f"/v1/jobs/{job}/video", json={"seconds": 1})
+        assert (other.status_code, other.json()["code"]) == (503, "busy")
+    wait_for(lambda: client.get(f"/v1/jobs/{job}/artifacts").json() != before, "the video to be published")
+    assert len(frames(client, job)) == 60
 
 
 @pytest.mark.parametrize(
@@ -106,16 +104,14 @@ def test_video_that_nobody_waits_for_is_completed(service: Service, job: str) ->
     ],
 )
 def test_options_beyond_the_limits_are_refused(
-    service: Service, job: str, options: dict[str, Any], status: int, message: str
+    client: httpx2.Client, job: str, options: dict[str, Any], status: int, message: str
 ) -> None:
-    with service.client() as client:
-        answer = client.post(f"/v1/jobs/{job}/video", json=options)
-        assert answer.status_code == status
-        assert message in answer.text
+    answer = client.post(f"/v1/jobs/{job}/video", json=options)
+    assert answer.status_code == status
+    assert message in answer.text
 
 
-def test_jobs_without_a_result_have_no_video(service: Service, job: str) -> None:
-    with service.client() as client:
-        assert client.post(f"/v1/jobs/{'job_' + 31 * '0'}/video", json={}).status_code == 404
-        broken = client.post(f"/v1/jobs/{job}/video", content=b"{", headers={"Content-Type": "application/json"})
-        assert broken.status_code in (400, 422)
+def test_jobs_without_a_result_have_no_video(client: httpx2.Client, job: str) -> None:
+    assert client.post(f"/v1/jobs/{'job_' + 31 * '0'}/video", json={}).status_code == 404
+    broken = client.post(f"/v1/jobs/{job}/video", content=b"{", headers={"Content-Type": "application/json"})
+    assert broken.status_code in (400, 422)
