@@ -5,7 +5,6 @@ import io
 import json
 import os
 import signal
-import stat
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -25,7 +24,7 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import EXTRA_FORMATS, by_name
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
-from tests.api.service import ROOT, Service, wait_for
+from tests.api.service import ROOT, Service, undisturbed, wait_for
 from tests.api.service import submit as submit_job
 from tests.small_scenes import wall, write_files
 
@@ -49,15 +48,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> I
 @pytest.fixture(scope="module")
 def expected(files: dict[str, Path], service: Service, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """Return the result of `sgsst stylize` for the same files and settings."""
-    return stylized(files, service, tmp_path_factory.mktemp("cli"), STEPS)
-
-
-def stylized(files: dict[str, Path], service: Service, folder: Path, steps: int) -> bytes:
-    command = [sys.executable, "-m", "api.cli", "stylize", str(files["scene"]), "--style", str(files["style"])]
-    command += ["--cameras", str(files["cameras"]), "--steps-sos", str(steps), "--no-early-stop", "--seed", "3"]
-    command += ["--backbone", "vgg16", "--out", str(folder / "stylized.ply")]
-    subprocess.run(command, check=True, env=service.environment, cwd=ROOT, stdout=subprocess.DEVNULL)
-    return (folder / "stylized.ply").read_bytes()
+    return undisturbed(files, PARAMETERS, tmp_path_factory.mktemp("cli")).read_bytes()
 
 
 def submit(client: httpx2.Client, files: dict[str, Path], **parameters: Any) -> str:
@@ -169,9 +160,7 @@ def test_job_from_submission_to_ply(
         assert hashlib.sha256(content.content).hexdigest() == entry["sha256"] == content.headers["etag"].strip('"')
         assert content.headers["content-type"] == entry["media_type"]
         assert str(service.data).encode() not in content.content, f"{entry['name']} tells where the service's data is"
-    assert result(client, job_id) == stylized(files, service, tmp_path, FEW_STEPS)
-    modes = {path: status.st_mode for path, status in service.stored().items() if stat.S_ISREG(status.st_mode)}
-    assert not [path for path, mode in modes.items() if mode & 0o077]
+    assert result(client, job_id) == undisturbed(files, PARAMETERS | {"steps_sos": FEW_STEPS}, tmp_path).read_bytes()
 
 
 @pytest.mark.slow
@@ -334,15 +323,6 @@ def test_restart_resumes_running_jobs(files: dict[str, Path], expected: bytes, t
         assert result(client, job_id) == expected
     assert service.process("service.scheduling.dispatcher") is None
     assert not any((tmp_path / "data" / "work").iterdir())
-
-
-@pytest.mark.slow
-def test_job_on_two_ranks(service: Service, client: httpx2.Client, files: dict[str, Path]) -> None:
-    job_id = submit(client, files, workers=2, steps_sos=4)
-    ended = wait_until(service, client, job_id, "succeeded", "failed")
-    log = client.get(f"/v1/jobs/{job_id}/artifacts/log.txt").text
-    assert ended["status"] == "succeeded", log
-    assert ended["result"]["steps"] == 4
 
 
 @pytest.mark.slow

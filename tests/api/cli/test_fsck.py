@@ -18,7 +18,6 @@ from api.cli.main import main
 from service.files.blobs import open_blobs
 from service.files.objects import Artifacts, ObjectStore
 from service.inputs import CHECKPOINT
-from service.problems import LostFileError
 from service.scheduling import housekeeping as fsck
 from service.settings import ServiceSettings
 from service.store import Store
@@ -212,14 +211,6 @@ def test_fsck_of_running_service_finds_nothing(service: Files, capsys: pytest.Ca
         finally:
             stop.set()
         working.result()
-
-
-def test_lost_file_sets_its_exit_code(service: Files) -> None:
-    name = service.input(b"content")
-    service.lose(name)
-    sha256 = name.split("/")[2].partition("-")[0]
-    with pytest.raises(LostFileError):
-        service.blobs.objects.check(name, sha256)
 
 
 def test_folder_without_database_is_rejected_unchanged(

@@ -3,15 +3,11 @@
 import stat
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import httpx2
 import pytest
 
-from api.http import jobs as routes
 from service.files.objects import Artifacts
-from service.problems import LostFileError, NotFoundError
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.queue import Lease
@@ -81,24 +77,6 @@ def test_damaged_result_is_not_sent(
     assert f"/{path.name} sha256=" in service.log.read_text()[logged:]
     path.unlink()
     refused(client.get(where), "file-lost")
-
-
-def test_replaced_result_is_not_reported_lost(
-    service: Service, store: Store, client: httpx2.Client, paths: dict[str, Path], tmp_path: Path
-) -> None:
-    job_id = submit(client, paths)
-    path = publish(service, store, job_id, "plan.json", b"{}", tmp_path)
-    before = store.jobs.artifact(job_id, "plan.json")
-    assert before is not None
-    context: Any = SimpleNamespace(store=store, artifacts=Artifacts(ServiceSettings(data=service.data).artifacts_url))
-    path.unlink()
-    with pytest.raises(LostFileError):
-        routes.check_artifact(context, before)
-    store.jobs.cancel(job_id, None)
-    store.leases.stop(Lease(store.jobs.get(job_id, None), "one", 1))
-    store.jobs.delete(job_id, None)
-    with pytest.raises(NotFoundError):
-        routes.check_artifact(context, before)
 
 
 @pytest.mark.parametrize("lost", [True, False])

@@ -151,12 +151,6 @@ def fetch(stored: Stored, *urls: str, requests: int = 1, bytes_quota: int | None
 # --- allowed hosts --------------------------------------------------------------------------------------------------
 
 
-def test_file_is_stored_with_its_digest(stored: Stored, files: FileServer) -> None:
-    url = files.url("/scene.ply", sends(FILE))
-    assert fetch(stored, url, url_hosts=files.origin) == [hashlib.sha256(FILE).hexdigest()]
-    assert files.requests == [(f"127.0.0.1:{files.server_port}", "/scene.ply")]
-
-
 def test_nothing_is_fetched_by_default(stored: Stored, files: FileServer) -> None:
     with raises_problem(problems.URLS_OFF):
         fetch(stored, files.url("/a", sends(FILE)))
@@ -412,14 +406,6 @@ def test_deadline_covers_lookups(stored: Stored, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(socket, "getaddrinfo", lambda *arguments, **named: release.wait(PATIENCE) and [])
     with raises_problem(problems.URL_NOT_FETCHED, match="within"):
         fetch(stored, "https://allowed.example/", url_hosts="allowed.example", url_seconds=0.5)
-    release.set()
-
-
-def test_requests_of_one_owner_are_limited(stored: Stored, files: FileServer) -> None:
-    release = threading.Event()
-    url = files.url("/a", lambda handler: release.wait(PATIENCE))
-    with raises_problem(problems.BUSY):
-        fetch(stored, url, requests=5, url_hosts=files.origin)
     release.set()
 
 

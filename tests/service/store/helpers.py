@@ -1,8 +1,11 @@
 """Helpers for tests of the store: a simulated clock, jobs, and the usage of keys."""
 
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
@@ -65,3 +68,25 @@ def usage_of(store: Store, owner: str) -> Used:
         row = session.get(UsageRow, (owner, day_of(store.database.clock())))
         jobs, seconds = (row.jobs, row.gpu_seconds) if row is not None else (0, 0.0)
         return Used(jobs, seconds, stored_bytes(session, owner))
+
+
+def at_once(work: Callable[[], object], times: int) -> int:
+    """Call `work` concurrently in `times` threads; return the number of calls that were not refused."""
+    ready, passed, broken = threading.Barrier(times), [], []
+
+    def one() -> None:
+        ready.wait()
+        try:
+            passed.append(work())
+        except ServiceError:
+            return
+        except BaseException as error:
+            broken.append(error)
+
+    threads = [threading.Thread(target=one) for _ in range(times)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not broken, broken
+    return len(passed)

@@ -1,19 +1,17 @@
 """Tests of API key quotas: usage is counted exactly, requests beyond a limit are refused, and usage is released."""
 
-import threading
-from collections.abc import Callable
 from datetime import date
 
 import pytest
 
 from service import problems
-from service.problems import ConflictError, NotFoundError, ServiceError
+from service.problems import NotFoundError, ServiceError
 from service.states import Published
 from service.store import Store
 from service.store.files import GRACE_SECONDS
 from service.store.keys import NO_QUOTAS, Quotas, Usage
 from tests.raised import raises_problem
-from tests.service.store.helpers import LEASE, SHA, Clock, Used, lease, new_job, queue, usage_of
+from tests.service.store.helpers import LEASE, SHA, Clock, Used, at_once, lease, new_job, queue, usage_of
 
 DAY = 86_400.0
 
@@ -167,28 +165,6 @@ def test_retry_is_bounded_like_a_new_job(store: Store, clock: Clock) -> None:
     store.jobs.retry(job_id, "local", limit=10, quotas=quotas)
 
 
-def at_once(work: Callable[[], object], times: int) -> int:
-    """Call `work` concurrently in `times` threads; return the number of calls that were not refused."""
-    ready, passed, broken = threading.Barrier(times), [], []
-
-    def one() -> None:
-        ready.wait()
-        try:
-            passed.append(work())
-        except ServiceError:
-            return
-        except BaseException as error:
-            broken.append(error)
-
-    threads = [threading.Thread(target=one) for _ in range(times)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not broken, broken
-    return len(passed)
-
-
 def test_concurrent_requests_exceed_no_limit(store: Store) -> None:
     """On PostgreSQL, transactions do not see each other's rows, so without a lock, all requests would be accepted."""
     bytes_of_two = Quotas(stored_bytes=10)
@@ -205,16 +181,6 @@ def test_concurrent_requests_exceed_no_limit(store: Store) -> None:
     assert at_once(lambda: store.jobs.retry(canceled.pop(), "g", limit=3), 8) == 3
     for owner, stored in (("c", 8), ("d", 8), ("f", 8)):
         assert usage_of(store, owner).stored_bytes == stored
-
-
-def test_quota_errors_name_the_quota(store: Store) -> None:
-    store.inputs.create_upload("local", 4, "x", "", 1000, most=1)
-    with pytest.raises(ConflictError, match="1 unfinished uploads"):
-        store.inputs.create_upload("local", 4, "x", "", 1000, most=1)
-    job_id = queue(store)
-    store.jobs.cancel(job_id, "local")
-    with raises_problem(problems.QUEUE_FULL):
-        store.jobs.retry(job_id, "local", limit=0)
 
 
 # --- receipts -----------------------------------------------------------------------------------------------------

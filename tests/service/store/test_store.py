@@ -4,7 +4,6 @@ import itertools
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from tests.service.store.helpers import (
     RETRY,
     SHA,
     Clock,
+    at_once,
     lease,
     new_job,
     queue,
@@ -124,7 +124,7 @@ def test_concurrent_requests_with_one_idempotency_key_create_one_job(store: Stor
         job, created = store.jobs.create(new_job(), limit=100, idempotency=Idempotency("k", "f" * 64))
         outcomes.append((job.id, created))
 
-    _at_once(create, 8)
+    at_once(create, 8)
     assert len({job_id for job_id, _ in outcomes}) == 1
     assert sum(created for _, created in outcomes) == 1
 
@@ -137,19 +137,11 @@ def test_concurrent_dispatchers_lease_every_job_once(store: Store) -> None:
         while (held := store.leases.take(threading.current_thread().name)) is not None:
             leased.append(held.job_id)
 
-    _at_once(work, 4)
+    at_once(work, 4)
     # with PostgreSQL, a dispatcher may find nothing while another one holds the next row
     while (held := store.leases.take("last")) is not None:
         leased.append(held.job_id)
     assert sorted(leased) == sorted(expected)
-
-
-def _at_once(work: Callable[[], None], count: int) -> None:
-    threads = [threading.Thread(target=work) for _ in range(count)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
 
 
 def test_lost_lease_cannot_write(store: Store, clock: Clock) -> None:
@@ -219,25 +211,6 @@ def test_loss_counts_once_without_free_capacity(store: Store, clock: Clock) -> N
     assert [row.outcome for row in store.jobs.detail(job_id, None)[1]] == ["lost", None]
 
 
-def test_outages_never_fail_a_job(store: Store, clock: Clock) -> None:
-    job_id = queue(store)
-    outage, error = {"code": "infrastructure", "message": "x"}, {"code": "x", "message": "x"}
-    assert store.leases.fail(lease(store), error, permanent=False)
-    clock.now += RETRY + 0.1
-    for outages in range(2 * ATTEMPTS):
-        assert store.leases.fail(lease(store), outage, permanent=False)
-        wait = RETRY * 2**outages
-        clock.now += wait - 0.1
-        assert store.leases.take("one") is None, "the wait doubles with each"
-        clock.now += 0.2
-    assert store.leases.fail(lease(store), error, permanent=False), "outages do not count"
-    clock.now += 2 * RETRY + 0.1
-    assert store.leases.fail(lease(store), outage, permanent=False)
-    clock.now += RETRY + 0.1
-    assert not store.leases.fail(lease(store), error, permanent=False)
-    assert store.jobs.get(job_id, "local").status == "failed"
-
-
 def fail_at(store: Store, clock: Clock, saved: int | None, *, lost: bool = False) -> bool:
     """Run an attempt that saves a checkpoint and fails; return whether the job will be retried."""
     clock.now += 1000
@@ -273,33 +246,20 @@ def test_job_that_fails_at_the_same_step_is_given_up(store: Store, clock: Clock)
     assert [fail_at(store, clock, 90) for _ in range(ATTEMPTS)] == [True, True, False]
 
 
-def test_ended_jobs_are_swept_once(store: Store, clock: Clock) -> None:
-    error = {"code": "x", "message": "x"}
-    jobs = []
-    for _ in range(3):
-        jobs.append(queue(store))
-        clock.now += 1
-    first, second, third = jobs
-    store.leases.succeed(lease(store), [], {})
-    store.leases.fail(lease(store), error, permanent=True)
-    assert sorted(store.retention.unswept(10)) == [(first, 1), (second, 1)]
+def test_ended_jobs_are_swept_once(store: Store) -> None:
+    job_id, never_run = queue(store), queue(store)
+    store.jobs.cancel(never_run, "local")
+    store.leases.fail(lease(store), {"code": "x", "message": "x"}, permanent=True)
+    assert sorted(store.retention.unswept(10)) == sorted([(job_id, 1), (never_run, 0)])
     assert len(store.retention.unswept(1)) == 1
-    store.retention.mark_swept(first, 1)
-    store.retention.mark_swept(third, 0)
-    assert store.retention.unswept(10) == [(second, 1)]
-    store.jobs.retry(second, "local", limit=10)
-    store.retention.mark_swept(second, 1)  # too late: the job has been queued again
-    store.jobs.cancel(third, "local")
+    store.retention.mark_swept(never_run, 0)
+    store.jobs.retry(job_id, "local", limit=10)
+    store.retention.mark_swept(job_id, 1)  # too late: the job has been queued again
     store.leases.succeed(lease(store), [], {})
-    assert sorted(store.retention.unswept(10)) == [(second, 2), (third, 0)]
-    store.retention.mark_swept(second, 1)  # of an earlier lease
-    assert sorted(store.retention.unswept(10)) == [(second, 2), (third, 0)]
-    store.retention.mark_swept(second, 2)
-    store.retention.mark_swept(third, 0)
+    store.retention.mark_swept(job_id, 1)  # of an earlier lease
+    assert store.retention.unswept(10) == [(job_id, 2)]
+    store.retention.mark_swept(job_id, 2)
     assert store.retention.unswept(10) == []
-    store.jobs.retry(third, "local", limit=10)
-    store.leases.succeed(lease(store), [], {})
-    assert store.retention.unswept(10) == [(third, 1)], "it has run again since"
 
 
 def test_dispatchers_are_alive_while_they_send_heartbeats(store: Store, clock: Clock) -> None:
@@ -318,16 +278,6 @@ def test_dispatchers_are_alive_while_they_send_heartbeats(store: Store, clock: C
     store.retention.expire()
     with store.database.reading() as session:
         assert session.connection().exec_driver_sql("SELECT name FROM dispatchers").scalars().all() == ["three"]
-
-
-def test_job_of_another_owner_is_not_found(store: Store) -> None:
-    job_id = queue(store, "a")
-    for use in (store.jobs.get, store.jobs.detail, store.jobs.cancel, store.jobs.delete):
-        with pytest.raises(NotFoundError):
-            use(job_id, "b")
-    with pytest.raises(NotFoundError):
-        store.jobs.retry(job_id, "b", limit=1)
-    assert store.jobs.page("b") == []
 
 
 def test_old_progress_events_are_deleted_but_not_status_events(store: Store) -> None:
