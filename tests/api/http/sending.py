@@ -1,5 +1,6 @@
 """Requests of tests, parts of them, and the check of refusals."""
 
+import base64
 import io
 import re
 import socket
@@ -72,9 +73,11 @@ END = f"--{BOUNDARY}--\r\n".encode()
 FILE = 'Content-Disposition: form-data; name="{}"; filename="x"'
 
 
-def begin(client: httpx2.Client, size: int) -> str:
-    answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(size)})
+def begin(client: httpx2.Client, size: int, name: str = "scene.ply") -> str:
+    metadata = f"filename {base64.b64encode(name.encode()).decode()}"
+    answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(size), "Upload-Metadata": metadata})
     assert answer.status_code == 201, answer.text
+    assert answer.headers["upload-expires"].endswith("GMT")
     return str(answer.headers["location"])
 
 

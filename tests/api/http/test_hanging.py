@@ -20,7 +20,7 @@ from service.deadlines import FileThreads, suspended
 from service.problems import StoreError
 from service.settings import ServiceSettings
 from service.store import open_store
-from tests.api.http.test_api import form
+from tests.api.http.sending import form
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.ports import free_port
 from tests.service.files.s3 import FaultyS3, environment_of, s3_server

@@ -19,7 +19,7 @@ from api.http.sessions import MOST_FAILURES
 from service.problems import SHARE_ID, SHARE_TOKEN
 from service.settings import ServiceSettings
 from service.store import open_store
-from tests.api.http.test_api import TUS, form, refused
+from tests.api.http.sending import TUS, form, refused
 from tests.api.service import Service, wait_for
 from tests.postgres import Postgres, controlled_server, fresh_database, is_installed
 

@@ -19,7 +19,7 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from service.store.keys import NO_QUOTAS, Quotas
 from tests.api.conftest import Sgsst
-from tests.api.http.test_api import TUS, form, refused
+from tests.api.http.sending import TUS, begin, form, refused, send
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.postgres import fresh_database, is_installed, server
 from tests.raised import raises_problem
@@ -235,9 +235,8 @@ def test_deleted_uploads_release_quota(service: Service) -> None:
     with service.client(key(service, Quotas(stored_bytes=5 * MB))) as client:
         for _ in range(3):
             content = os.urandom(4 * MB)
-            where = client.post("/v1/uploads", headers=TUS | {"Upload-Length": str(len(content))}).headers["location"]
-            sent = TUS | {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
-            assert client.patch(where, content=content, headers=sent).status_code == 204
+            where = begin(client, len(content))
+            assert send(client, where, 0, content).status_code == 204
             assert client.delete(where, headers=TUS).status_code == 204
             assert on_disk(service) == before
 
@@ -248,9 +247,6 @@ def stored_bytes(service: Service, owner: str) -> int:
         return usage_of(store, owner).stored_bytes
     finally:
         store.close()
-
-
-# --- one key beside another ----------------------------------------------------------------------------------------
 
 
 # --- many requests at once -----------------------------------------------------------------------------------------
@@ -278,8 +274,8 @@ def test_concurrent_requests_stay_within_limits(tmp_path: Path, files: dict[str,
         assert at_once(service, daily, "/v1/jobs", files=form(files)) == {202: 4, 429: 96}
 
         owner, uploads = owner_and_key(service, Quotas(stored_bytes=10 * MB))
-        begin = TUS | {"Upload-Length": str(3 * MB)}
-        assert at_once(service, uploads, "/v1/uploads", headers=begin) == {201: 3, 429: 97}
+        length = TUS | {"Upload-Length": str(3 * MB)}
+        assert at_once(service, uploads, "/v1/uploads", headers=length) == {201: 3, 429: 97}
         assert stored_bytes(service, owner) == 9 * MB
 
         owner, requests = owner_and_key(service, Quotas(stored_bytes=3 * size))

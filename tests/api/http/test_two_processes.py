@@ -14,10 +14,8 @@ import pytest
 
 from service.settings import ServiceSettings
 from service.store import Store, open_store
+from tests.api.http.sending import OFFSET_STREAM, TUS, begin
 from tests.api.service import Service, wait_for
-
-TUS = {"Tus-Resumable": "1.0.0"}
-STREAM = "application/offset+octet-stream"
 
 
 @dataclass
@@ -41,12 +39,6 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
         store.close()
 
 
-def begin(client: httpx2.Client, length: int) -> str:
-    answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(length)})
-    assert answer.status_code == 201, answer.text
-    return str(answer.headers["location"])
-
-
 class Patch:
     """PATCH request that is sent a few bytes at a time."""
 
@@ -60,7 +52,7 @@ class Patch:
             f"Host: {address.netloc}",
             "Tus-Resumable: 1.0.0",
             f"Upload-Offset: {offset}",
-            f"Content-Type: {STREAM}",
+            f"Content-Type: {OFFSET_STREAM}",
             f"Content-Length: {len(content)}",
             "Connection: close",
             *(["Expect: 100-continue"] if expect else []),
@@ -114,7 +106,7 @@ def interleave(pair: Pair, clients: tuple[httpx2.Client, httpx2.Client], order: 
         shown = clients[0].get(where).json()
         if not shown["complete"]:
             rest = b"z" * (length - shown["offset"])
-            headers = {**TUS, "Upload-Offset": str(shown["offset"]), "Content-Type": STREAM}
+            headers = {**TUS, "Upload-Offset": str(shown["offset"]), "Content-Type": OFFSET_STREAM}
             statuses.add(clients[1].patch(where, content=rest, headers=headers).status_code)
         return shown if shown["complete"] else None
 
