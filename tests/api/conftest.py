@@ -8,8 +8,7 @@ import httpx2
 import pytest
 
 from api.cli.main import main
-from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import Store
 from tests.api.service import Service, wait_for
 from tests.small_scenes import wall, write_files
 
@@ -80,9 +79,8 @@ def paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(scope="module")
 def store(service: Service) -> Iterator[Store]:
     """Yield the database of the service."""
-    opened = open_store(ServiceSettings(data=service.data))
-    yield opened
-    opened.close()
+    with service.store() as opened:
+        yield opened
 
 
 @pytest.fixture(scope="module")

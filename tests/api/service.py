@@ -22,7 +22,8 @@ import psutil
 from api.http.app import create_app
 from service.files.objects import Artifacts
 from service.settings import ServiceSettings
-from service.store import open_store
+from service.states import Published
+from service.store import Store, open_store
 from tests.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -130,22 +131,48 @@ class Service:
         finally:
             supervisor.resume()
 
+    @contextlib.contextmanager
+    def store(self) -> Iterator[Store]:
+        """Yield the service's database."""
+        settings = ServiceSettings(data=self.data, database=self.environment.get("SGSST_DATABASE"))
+        with contextlib.closing(open_store(settings)) as opened:
+            yield opened
+
+    def key(self, name: str = "me") -> str:
+        """Create an API key."""
+        with self.store() as store:
+            return store.keys.create(name)[1]
+
     def finish(self, job_id: str, contents: Mapping[str, bytes], **result: Any) -> None:
-        """Finish a queued job, and those before it, with these artifacts by name, in place of a dispatcher."""
-        settings = ServiceSettings(data=self.data)
-        artifacts, source = Artifacts(settings.artifacts_url), self.data.with_name("artifact")
-        with contextlib.closing(open_store(settings)) as store:
+        """Finish a queued job, and those before it, with these artifacts by name, in place of a dispatcher.
+
+        Those whose names start with a dot are published before the end, as checkpoints are.
+        """
+        artifacts, source = Artifacts(ServiceSettings(data=self.data).artifacts_url), self.data.with_name("artifact")
+        with self.store() as store:
             finished = ""
             while finished != job_id:
                 lease = store.leases.take("test")
                 assert lease is not None, f"{job_id} is not in the queue"
-                put = []
+                put: dict[bool, list[Published]] = {False: [], True: []}
                 for name, content in contents.items():
                     source.write_bytes(content)
-                    put.append(artifacts.put(lease.job_id, lease.epoch, name, source))
+                    put[name.startswith(".")].append(artifacts.put(lease.job_id, lease.epoch, name, source))
                 store.leases.start(lease)
-                store.leases.succeed(lease, put, {"steps": 1, "loss_before": 2.0, "loss_after": 1.0, **result})
+                store.leases.publish(lease, put[True])
+                store.leases.succeed(lease, put[False], {"steps": 1, "loss_before": 2.0, "loss_after": 1.0, **result})
                 finished = lease.job_id
+
+    def succeeded(self, job_id: str) -> dict[str, Any]:
+        """Wait until a job has ended, and return it; fail if it has not succeeded."""
+
+        def ended() -> dict[str, Any] | None:
+            job: dict[str, Any] = httpx2.get(f"{self.url}/v1/jobs/{job_id}", timeout=60, verify=False).json()
+            return job if job["status"] in ("succeeded", "failed", "canceled") else None
+
+        job: dict[str, Any] = wait_for(ended, f"the end of {job_id}", self.said)
+        assert job["status"] == "succeeded", f"{job['error']}\n{self.said()}"
+        return job
 
     def survivors(self) -> list[psutil.Process]:
         """Return all running processes that the service has started, including those in other sessions."""

@@ -18,9 +18,7 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from api.client import Client
 from sgsst_core import container
-from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import EXTRA_FORMATS, by_name
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
@@ -81,16 +79,10 @@ def wait_for_step(service: Service, client: httpx2.Client, job_id: str, step: in
 def events(client: httpx2.Client, job_id: str, after: int = 0) -> list[tuple[int, str, dict[str, Any]]]:
     """Return all events until the service closes the stream."""
     headers = {"Last-Event-ID": str(after)} if after else {}
-    received = []
-    with client.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers) as stream:
-        if stream.status_code == 204:
+    with client.sse(f"/v1/jobs/{job_id}/events", headers=headers) as stream:
+        if stream.response.status_code == 204:
             return []
-        assert stream.headers["content-type"].startswith("text/event-stream")
-        for block in "".join(stream.iter_text()).split("\n\n"):
-            fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
-            if "data" in fields:
-                received.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
-    return received
+        return [(int(sent.id), sent.event, json.loads(sent.data)) for sent in stream if sent.data]
 
 
 def result(client: httpx2.Client, job_id: str) -> bytes:
@@ -205,14 +197,6 @@ def test_compressed_scene_and_results_in_other_formats(
     other = client.get(f"/v1/jobs/{job_id}/artifacts/report.json", params={"format": "spz"})
     assert (other.status_code, other.json()["code"]) == (422, "invalid-request")
     assert list((service.data / "packing").iterdir()) == []
-    with Client(service.url) as user:
-        user.download(job_id, tmp_path / "mine", format="spz")
-        assert (tmp_path / "mine").read_bytes() == client.get(where, params={"format": "spz"}).content
-        assert user.download(job_id, tmp_path / "scene.html").read_text() == page.text
-        assert read_scene(user.download(job_id, tmp_path / "scene.sog")).format == "sog"
-        assert user.download(job_id, tmp_path / "plain").read_bytes() == client.get(where).content
-        with pytest.raises(OutputError, match="does not end in"):
-            user.download(job_id, tmp_path / "scene.usdz")
     command = [sys.executable, "-m", "api.cli", "download", job_id, "--url", service.url]
     command += ["--out", str(tmp_path / "other.compressed.ply")]
     ended = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)

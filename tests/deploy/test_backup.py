@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,10 +70,6 @@ def job(client: httpx2.Client, job_id: str) -> dict[str, Any]:
     return dict(client.get(f"/v1/jobs/{job_id}").json())
 
 
-def has_ended(client: httpx2.Client, job_id: str) -> bool:
-    return job(client, job_id)["status"] in ("succeeded", "failed")
-
-
 def lose(service: Service) -> None:
     """Kill all processes of a service at once."""
     for process in service.survivors():
@@ -98,7 +93,7 @@ def test_jobs_continue_after_a_restore(
     saved = tmp_path / "backup"
     with Service(tmp_path / "before", **before) as service, service.client() as client:
         done = submit(client, files, steps_sos=20)
-        wait_for(lambda: job(client, done)["status"] == "succeeded", "the first job", service.said)
+        service.succeeded(done)
         first = client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content
         running = submit(client, files)
         waiting = submit(client, files, steps_sos=20)
@@ -118,8 +113,7 @@ def test_jobs_continue_after_a_restore(
     with Service(tmp_path / "after", **after) as service, service.client() as client:
         assert client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content == first
         for job_id in (running, waiting):
-            wait_for(partial(has_ended, client, job_id), "its end", service.said)
-            assert job(client, job_id)["status"] == "succeeded", job(client, job_id)
+            service.succeeded(job_id)
         assert client.get(f"/v1/jobs/{running}/artifacts/stylized.ply").content == expected
         assert job(client, running)["attempt"] > 1
         log = client.get(f"/v1/jobs/{running}/artifacts/log.txt").text

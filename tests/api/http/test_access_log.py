@@ -14,10 +14,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from api.http.app import create_app
 from service.settings import ServiceSettings
-from service.store import open_store
-from service.store.jobs import NewJob
 from tests.api.service import Service
-from tests.service.store.helpers import SHA
+from tests.service.store.helpers import SHA, queue
 
 
 class FaultError(Exception):
@@ -108,12 +106,10 @@ def test_every_response_is_logged_and_counted(
 
 def test_streams_that_end_with_the_service_are_no_errors(tmp_path: Path) -> None:
     with Service(tmp_path / "data", alone=True) as service, service.client() as client:
-        store = open_store(ServiceSettings(data=service.data))
-        store.inputs.add_blob(SHA, "aa/blob", 3)
-        scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
-        job, _ = store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-        store.close()
-        with client.sse(f"/v1/jobs/{job.id}/events") as stream:
+        with service.store() as store:
+            store.inputs.add_blob(SHA, "aa/blob", 3)
+            job_id = queue(store)
+        with client.sse(f"/v1/jobs/{job_id}/events") as stream:
             events = (sent.event for sent in stream if sent.data)
             assert next(events) == "status"
             service.stop()

@@ -7,10 +7,7 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from service.files.objects import Artifacts
-from service.settings import ServiceSettings
 from service.store import Store
-from service.store.queue import Lease
 from tests.api.service import Service, check_documented, submit
 
 
@@ -21,24 +18,6 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     data.chmod(0o755)  # as an earlier version created it
     with Service(data, alone=True) as running:
         yield running
-
-
-def lease_of(store: Store, job_id: str) -> Lease:
-    while (lease := store.leases.take("one")) is not None:
-        if lease.job_id == job_id:
-            return lease
-    raise AssertionError(f"{job_id} is not in the queue")
-
-
-def publish(service: Service, store: Store, job_id: str, name: str, content: bytes, folder: Path) -> Path:
-    """Publish a file as a result of a job, and return its path."""
-    artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
-    source = folder / "made"
-    source.write_bytes(content)
-    lease = lease_of(store, job_id)
-    put = artifacts.put(job_id, lease.epoch, name, source)
-    store.leases.publish(lease, [put])
-    return service.data / "artifacts" / put.location
 
 
 def flip(path: Path) -> None:
@@ -63,10 +42,11 @@ def blob_of(service: Service, store: Store, job_id: str, role: str) -> Path:
 
 
 def test_damaged_result_is_not_sent(
-    service: Service, store: Store, client: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, client: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     job_id = submit(client, paths)
-    path = publish(service, store, job_id, "plan.json", b'{"a": 1}' * 1000, tmp_path)
+    service.finish(job_id, {"plan.json": b'{"a": 1}' * 1000})
+    path = service.data / "artifacts" / store.jobs.artifacts(job_id)[0].location
     where = f"/v1/jobs/{job_id}/artifacts/plan.json"
     sent = client.get(where)
     assert (sent.status_code, sent.content) == (200, b'{"a": 1}' * 1000)

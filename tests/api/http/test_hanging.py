@@ -18,13 +18,10 @@ from api.http.app import Deadlines
 from service import problems
 from service.deadlines import FileThreads, suspended
 from service.problems import StoreError
-from service.settings import ServiceSettings
-from service.store import open_store
 from tests.api.http.sending import form
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.ports import free_port
 from tests.service.files.s3 import FaultyS3, environment_of, s3_server
-from tests.small_scenes import wall, write_files
 
 #: Concurrent downloads of one key: more than the API has threads for.
 MANY = 60
@@ -67,19 +64,15 @@ def hanging_folder(folder: Path) -> Iterator[Hanging]:
 
 @pytest.mark.parametrize("kind", [pytest.param(hanging_store, marks=pytest.mark.slow), hanging_folder])
 def test_hanging_files_delay_only_requests_that_need_them(
-    tmp_path: Path, kind: Callable[..., AbstractContextManager[Hanging]]
+    tmp_path: Path, files: dict[str, bytes], kind: Callable[..., AbstractContextManager[Hanging]]
 ) -> None:
     """The deadline is longer than the patience of the other key's client."""
     data = tmp_path / "data"
-    ply, cameras, style = write_files(tmp_path, wall())
-    files = {"scene": ply.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
     with ExitStack() as stack:
         settings, hang, heal = stack.enter_context(kind(data))
         settings |= {"SGSST_REQUIRE_KEYS": "true", "SGSST_ANSWER_SECONDS": str(PATIENCE)}
         service = stack.enter_context(Service(data, alone=True, **settings))
-        store = open_store(ServiceSettings(data=data))
-        mine, others = (service.client(store.keys.create(name)[1]) for name in ("me", "other"))
-        store.close()
+        mine, others = (service.client(service.key()) for _ in range(2))
         mine.timeout = httpx2.Timeout(PATIENCE)
         job_id = mine.post("/v1/jobs", files=form(files)).json()["id"]
         hang()

@@ -18,7 +18,6 @@ from api.http.app import create_app
 from api.http.sessions import MOST_FAILURES
 from service.problems import SHARE_ID, SHARE_TOKEN
 from service.settings import ServiceSettings
-from service.store import open_store
 from tests.api.http.sending import TUS, form, refused
 from tests.api.service import Service, wait_for
 from tests.postgres import Postgres, controlled_server, fresh_database, is_installed
@@ -78,9 +77,7 @@ def open_service(data: Path, database: str | None, files: dict[str, bytes]) -> I
     """Yield a service that requires keys, a key, and the ids of a job and of an upload that belong to the key."""
     settings = {"SGSST_REQUIRE_KEYS": "true", **({"SGSST_DATABASE": database} if database else {})}
     with Service(data, alone=True, **settings) as service:
-        store = open_store(ServiceSettings(data=data, database=database))
-        _, key = store.keys.create("me")
-        store.close()
+        key = service.key()
         with service.client(key) as client:
             answer = client.post("/v1/jobs", files=form(files))
             assert answer.status_code == 202, answer.text

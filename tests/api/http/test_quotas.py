@@ -15,8 +15,6 @@ import pytest
 from api.http.context import Rates
 from service import problems
 from service.problems import ServiceError
-from service.settings import ServiceSettings
-from service.store import open_store
 from service.store.keys import NO_QUOTAS, Quotas
 from tests.api.conftest import Sgsst
 from tests.api.http.sending import TUS, begin, form, refused, send
@@ -69,10 +67,9 @@ def key(service: Service, quotas: Quotas) -> str:
 
 
 def owner_and_key(service: Service, quotas: Quotas) -> tuple[str, str]:
-    store = open_store(ServiceSettings(data=service.data, database=service.environment.get("SGSST_DATABASE")))
-    row, text = store.keys.create("someone", quotas=quotas)
-    store.close()
-    return row.id, text
+    with service.store() as store:
+        row, text = store.keys.create("someone", quotas=quotas)
+        return row.id, text
 
 
 def on_disk(service: Service) -> int:
@@ -242,11 +239,8 @@ def test_deleted_uploads_release_quota(service: Service) -> None:
 
 
 def stored_bytes(service: Service, owner: str) -> int:
-    store = open_store(ServiceSettings(data=service.data, database=service.environment.get("SGSST_DATABASE")))
-    try:
+    with service.store() as store:
         return usage_of(store, owner).stored_bytes
-    finally:
-        store.close()
 
 
 # --- many requests at once -----------------------------------------------------------------------------------------

@@ -14,12 +14,12 @@ from service import problems
 from service.scheduling.capacity import Machine
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.jobs import NewJob
 from service.store.keys import MOST_SESSIONS
 from tests.api.conftest import KEYED, Services
 from tests.api.http.sending import refused
 from tests.api.service import Service
 from tests.raised import raises_problem
+from tests.service.store.helpers import SHA, queue
 
 COOKIE = "sgsst_session"
 
@@ -59,10 +59,8 @@ def cookie_of(answer: httpx2.Response) -> Morsel[str]:
 
 def job_of(store: Store, owner: str) -> str:
     """Create a job whose scene was never uploaded, so that it never runs."""
-    sha256 = "a" * 64
-    store.inputs.add_blob(sha256, "aa/a", 10)
-    inputs = [{"role": "scene", "name": "scene.ply", "sha256": sha256, "size": 10}]
-    return store.jobs.create(NewJob(owner, "job", 0, {}, inputs), limit=1000)[0].id
+    store.inputs.add_blob(SHA, "aa/blob", 3)
+    return queue(store, owner)
 
 
 def test_key_is_exchanged_for_cookie(browser: httpx2.Client, store: Store) -> None:

@@ -12,8 +12,7 @@ import httpx2
 import pytest
 from sqlalchemy import update
 
-from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import Store
 from service.store.jobs import MOST_SHARES
 from service.store.tables import ShareRow
 from tests.api.conftest import KEYED, Services
@@ -32,7 +31,7 @@ def service(services: Services) -> Service:
 
 @pytest.fixture
 def me(service: Service, store: Store) -> Iterator[httpx2.Client]:
-    with service.client(store.keys.create("me")[1]) as client:
+    with service.client(service.key()) as client:
         yield client
 
 
@@ -285,7 +284,7 @@ def test_only_results_of_ones_own_can_be_shared(
     service: Service, store: Store, me: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     job_id = finished(me, service, paths)
-    with service.client(store.keys.create("other")[1]) as other:
+    with service.client(service.key()) as other:
         for method in ("GET", "POST"):
             assert_missing(other.request(method, f"/v1/jobs/{job_id}/shares", json={}))
         view, _ = share(me, job_id)
@@ -344,10 +343,8 @@ def test_stored_digest_is_no_token_and_logs_contain_none(
 def test_requests_of_a_link_are_limited(paths: dict[str, Path], tmp_path: Path) -> None:
     settings = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_REQUESTS_A_SECOND_PER_KEY": "0.5"}
     with Service(tmp_path / "data", alone=True, **settings) as service, service.client() as visitor:
-        store = open_store(ServiceSettings(data=service.data))
-        with service.client(store.keys.create("me")[1]) as me:
+        with service.client(service.key()) as me:
             _, token = share(me, finished(me, service, paths))
-        store.close()
         for path in (token, "shr_1.x"):
             answers = [visitor.get(f"/v1/shared/{path}") for _ in range(20)]
             refused(next(answer for answer in answers if answer.status_code == 429), 429, "rate-limited")
@@ -363,7 +360,7 @@ def test_link_whose_files_hang_occupies_no_thread_of_others(
     path = service.data / "artifacts" / row.location
     away, pipe = path.rename(path.with_suffix(".away")), path.with_suffix(".pipe")
     os.mkfifo(path)  # opening it takes until somebody else writes to it
-    with ThreadPoolExecutor(MANY) as pool, service.client(store.keys.create("other")[1]) as other:
+    with ThreadPoolExecutor(MANY) as pool, service.client(service.key()) as other:
         reads = [pool.submit(visitor.get, f"/v1/shared/{token}") for _ in range(MANY)]
         try:
             for _ in range(3):

@@ -27,9 +27,7 @@ def job(service: Service, paths: dict[str, Path]) -> str:
     """Return the id of a finished job."""
     with service.client() as client:
         job_id = submit(client, paths, **PARAMETERS)
-        wait_for(lambda: client.get(f"/v1/jobs/{job_id}").json()["status"] in ("succeeded", "failed"), "the job to end")
-        assert client.get(f"/v1/jobs/{job_id}").json()["status"] == "succeeded"
-        return job_id
+    return str(service.succeeded(job_id)["id"])
 
 
 def frames(client: httpx2.Client, job_id: str) -> list[Any]:

@@ -3,8 +3,7 @@
 import httpx2
 import pytest
 
-from service.settings import ServiceSettings
-from service.store import open_store
+from service.store import Store
 from tests.api.conftest import Services
 from tests.api.http.sending import form, refused
 from tests.api.service import Service
@@ -15,7 +14,7 @@ def service(services: Services) -> Service:
     return services(SGSST_TRUSTED_PROXIES="127.0.0.0/8", SGSST_REQUIRE_KEYS="false", SGSST_WEBHOOKS="true")
 
 
-def test_uncallable_webhook_urls_are_rejected(service: Service, client: httpx2.Client, files: dict[str, bytes]) -> None:
+def test_uncallable_webhook_urls_are_rejected(store: Store, client: httpx2.Client, files: dict[str, bytes]) -> None:
     def submit(url: str, **more: str) -> httpx2.Response:
         return client.post("/v1/jobs", files=form(files), data={"webhook": url, **more})
 
@@ -26,8 +25,6 @@ def test_uncallable_webhook_urls_are_rejected(service: Service, client: httpx2.C
     assert submit("https://example.com/hook", webhook_events="started, progress").status_code == 202
     for url, events in (("https://example.com/hook", "ended"), ("", "started")):
         assert "webhook_events" in str(refused(submit(url, webhook_events=events), 422, "invalid-request"))
-    store = open_store(ServiceSettings(data=service.data))
     chosen, default = (shown.row for shown in store.jobs.page(None, limit=2))
-    store.close()
     assert (default.webhook, default.webhook_events) == ("https://example.com/hook", None)
     assert chosen.webhook_events == ["started", "progress"]

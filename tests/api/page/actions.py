@@ -9,7 +9,7 @@ from typing import Any
 import httpx2
 
 from tests.api.page.browser import Watched
-from tests.api.service import Service, wait_for
+from tests.api.service import Service
 from tests.api.service import submit as submit_job
 
 Visit = Callable[..., Watched]
@@ -27,14 +27,7 @@ def submit(service: Service, files: dict[str, Path], key: str | None = None, **p
 
 def done(service: Service, job_id: str) -> str:
     """Wait until a job has succeeded, and return its id."""
-
-    def succeeded() -> bool:
-        status = httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["status"]
-        assert status not in ("failed", "canceled"), service.said()
-        return bool(status == "succeeded")
-
-    wait_for(succeeded, f"{job_id} to succeed", service.said)
-    return job_id
+    return str(service.succeeded(job_id)["id"])
 
 
 def choose(watched: Watched, files: dict[str, Path]) -> None:

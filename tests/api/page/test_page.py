@@ -1,8 +1,6 @@
 """Tests of the web page from a user's perspective, in a real browser with a real service."""
 
 import math
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +28,7 @@ from tests.api.page.actions import (
     submit,
 )
 from tests.api.page.browser import Watched, psnr, rendered
-from tests.api.service import ROOT, Service, wait_for
+from tests.api.service import Service, wait_for
 from tests.small_scenes import ball, wall, write_files
 
 pytestmark = pytest.mark.slow
@@ -310,7 +308,7 @@ def test_accessible_and_never_too_wide(
 
 def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path: Path, tiny_installed: Path) -> None:
     service = Service(tmp_path / "data", SGSST_REQUIRE_KEYS="true")
-    keys = [_new_key(service, name) for name in ("ann", "ben")]
+    keys = [service.key(name) for name in ("ann", "ben")]
     with service:
         job_id = submit(service, files, keys[0], name="of ann", **{"steps_sos": 10})
         ann, ben = (Watched(browser, service.url) for _ in keys)
@@ -355,12 +353,6 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
 
 def _jobs(service: Service) -> list[str]:
     return [job["id"] for job in httpx2.get(f"{service.url}/v1/jobs").json()["jobs"]]
-
-
-def _new_key(service: Service, name: str) -> str:
-    command = [sys.executable, "-m", "api.cli", "keys", "create", name]
-    process = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
-    return process.stdout.split()[-1]
 
 
 def test_fingers_turn_and_pinch(visit: Visit, tmp_path: Path) -> None:

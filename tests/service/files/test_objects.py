@@ -16,7 +16,7 @@ import pytest
 
 from service.files.objects import Artifacts, FileCache, ObjectStore
 from service.problems import DamagedFileError, LostFileError, NoSpaceError, StoreError
-from tests.api.service import Service, submit, undisturbed, wait_for
+from tests.api.service import Service, submit, undisturbed
 from tests.service.files.s3 import environment_of, s3_server
 from tests.small_scenes import wall, write_files
 
@@ -326,13 +326,7 @@ def test_api_and_dispatcher_share_a_bucket_and_no_folder(
         service.client() as client,
     ):
         where = f"/v1/jobs/{submit(client, files, **parameters)}"
-
-        def ended() -> bool:
-            return client.get(where).json()["status"] in ("succeeded", "failed")
-
-        wait_for(ended, "the job's end", service.said)
-        job = client.get(where).json()
-        assert job["status"] == "succeeded", job["error"]
+        service.succeeded(where.rpartition("/")[2])
         result = client.get(f"{where}/artifacts/stylized.ply")
         assert result.content == expected
         tail = client.get(f"{where}/artifacts/stylized.ply", headers={"Range": "bytes=-100"})

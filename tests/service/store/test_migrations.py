@@ -62,24 +62,18 @@ def test_this_version_runs_on_tables_of_the_next_one(tmp_path: Path, tiny_instal
 
     with Service(tmp_path / "data") as service, service.client() as client:
         job = submit(client)
-
-        def shown(job_id: str) -> dict[str, Any]:
-            return dict(client.get(f"/v1/jobs/{job_id}").json())
-
-        wait_for(lambda: shown(job)["status"] == "running", "the job's start", service.said)
+        where = f"/v1/jobs/{job}"
+        wait_for(lambda: client.get(where).json()["status"] == "running", "the job's start", service.said)
         environment = {**os.environ, "PYTHONPATH": str(code), "SGSST_DATA": str(service.data)}
         subprocess.run([sys.executable, "-m", "service.prepare"], env=environment, cwd=tmp_path, check=True)
         database = Database(f"sqlite:///{service.data / 'sgsst.db'}")
         with database.reading() as session:
             assert session.execute(text("SELECT version_num FROM alembic_version")).scalar_one() > SCHEMA
             assert session.execute(text("SELECT next FROM jobs")).scalar() == 7
-        wait_for(lambda: shown(job)["status"] in ("succeeded", "failed"), "the job's end", service.said)
-        assert shown(job)["status"] == "succeeded"
-        assert shown(job)["attempt"] == 1
+        assert service.succeeded(job)["attempt"] == 1
     with Service(tmp_path / "data") as service, service.client() as client:
         second = submit(client)
-        wait_for(lambda: shown(second)["status"] in ("succeeded", "failed"), "the second job", service.said)
-        assert shown(second)["status"] == "succeeded"
+        service.succeeded(second)
         first, other = (client.get(f"/v1/jobs/{each}/artifacts/stylized.ply").content for each in (job, second))
         assert first == other
     database.close()

@@ -11,8 +11,6 @@ import psutil
 import pytest
 import torch
 
-from service.files.objects import Artifacts
-from service.settings import ServiceSettings
 from service.store import Store
 from sgsst_core.files.formats import EXTRA_FORMATS
 from sgsst_core.files.scene_file import write_scene
@@ -101,7 +99,7 @@ def memory_of(process: psutil.Process, field: str) -> int:
 
 
 @pytest.fixture(scope="module")
-def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.TempPathFactory) -> str:
+def done(service: Service, files: Files) -> str:
     """Create a finished job with results, whose name attempts header injection."""
     with service.client() as client:
         name = 'x"; Set-Cookie: a=b <script>/../../é'
@@ -110,22 +108,8 @@ def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.
         for queued in client.get("/v1/jobs", params={"status": "queued", "limit": 200}).json()["jobs"]:
             if queued["id"] != job_id:
                 client.post(f"/v1/jobs/{queued['id']}/cancel")
-    lease = store.leases.take("test")
-    while lease is not None and lease.job_id != job_id:
-        store.leases.stop(lease)
-        lease = store.leases.take("test")
-    assert lease is not None
-    folder = tmp_path_factory.mktemp("results")
-    (folder / "stylized.ply").write_bytes(files["scene"])
-    (folder / "log.txt").write_bytes(b"")
-    (folder / "colors.f16").write_bytes(bytes(LARGE))
-    (folder / "report.html").write_text("<script>alert(1)</script>")
-    artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
-    published = [artifacts.put(job_id, lease.epoch, path.name, path) for path in sorted(folder.iterdir())]
-    published.append(artifacts.put(job_id, lease.epoch, ".checkpoint", folder / "log.txt"))
-    store.leases.start(lease)
-    store.leases.publish(lease, published)
-    store.leases.succeed(lease, published[:-1], {})
+    contents = {"stylized.ply": files["scene"], "log.txt": b"", "colors.f16": bytes(LARGE), ".checkpoint": b""}
+    service.finish(job_id, {**contents, "report.html": b"<script>alert(1)</script>"})
     return job_id
 
 
