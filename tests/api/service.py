@@ -22,7 +22,6 @@ import psutil
 from api.http.app import create_app
 from service.files.objects import Artifacts
 from service.settings import ServiceSettings
-from service.states import Published
 from service.store import Store, open_store
 from tests.ports import free_port
 
@@ -144,23 +143,19 @@ class Service:
             return store.keys.create(name)[1]
 
     def finish(self, job_id: str, contents: Mapping[str, bytes], **result: Any) -> None:
-        """Finish a queued job, and those before it, with these artifacts by name, in place of a dispatcher.
-
-        Those whose names start with a dot are published before the end, as checkpoints are.
-        """
+        """Finish a queued job, and those before it, with these artifacts by name, in place of a dispatcher."""
         artifacts, source = Artifacts(ServiceSettings(data=self.data).artifacts_url), self.data.with_name("artifact")
         with self.store() as store:
             finished = ""
             while finished != job_id:
                 lease = store.leases.take("test")
                 assert lease is not None, f"{job_id} is not in the queue"
-                put: dict[bool, list[Published]] = {False: [], True: []}
+                put = []
                 for name, content in contents.items():
                     source.write_bytes(content)
-                    put[name.startswith(".")].append(artifacts.put(lease.job_id, lease.epoch, name, source))
+                    put.append(artifacts.put(lease.job_id, lease.epoch, name, source))
                 store.leases.start(lease)
-                store.leases.publish(lease, put[True])
-                store.leases.succeed(lease, put[False], {"steps": 1, "loss_before": 2.0, "loss_after": 1.0, **result})
+                store.leases.succeed(lease, put, {"steps": 1, "loss_before": 2.0, "loss_after": 1.0, **result})
                 finished = lease.job_id
 
     def succeeded(self, job_id: str) -> dict[str, Any]:

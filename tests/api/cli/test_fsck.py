@@ -24,6 +24,7 @@ from service.store import Store
 from service.store.jobs import NewJob
 from service.store.queue import Lease
 from tests.service.files.s3 import environment_of, s3_server
+from tests.service.store import helpers
 from tests.stores import new_store
 
 HOUR = 3600.0
@@ -86,9 +87,7 @@ class Files:
         sha256 = scene.split("/")[2].partition("-")[0]
         entry = {"role": "scene", "name": "scene.ply", "sha256": sha256, "size": 1}
         self.store.jobs.create(NewJob("me", "", 0, {}, [entry]), limit=10_000)
-        lease = self.store.leases.take("one")
-        assert lease is not None
-        return lease
+        return helpers.lease(self.store)
 
     def results(self, lease: Lease, contents: dict[str, bytes]) -> list[str]:
         put = [self.artifacts.put(lease.job_id, lease.epoch, name, self.file(data)) for name, data in contents.items()]

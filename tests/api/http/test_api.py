@@ -49,6 +49,7 @@ from tests.api.http.sending import (
 )
 from tests.api.service import Service, wait_for
 from tests.pngs import chunk, png
+from tests.service.store.helpers import lease
 from tests.small_scenes import ball, write_files
 
 
@@ -613,15 +614,11 @@ def test_metrics_count_attempts_by_outcome(tmp_path: Path, files: dict[str, byte
             client.post("/v1/jobs", files=form(files))
         now = time.time()
         store = open_store(ServiceSettings(data=service.data), lambda: now)
-        held = store.leases.take("lost")
-        assert held is not None
+        lease(store, "lost")
         now += 1000
-        held = store.leases.take("one")
-        assert held is not None
-        store.leases.fail(held, {"code": "x", "message": "x"}, permanent=True)
+        store.leases.fail(lease(store), {"code": "x", "message": "x"}, permanent=True)
         for step, seconds in ((30, 10.0), (8, 4.0)):
-            held = store.leases.take("one")
-            assert held is not None
+            held = lease(store)
             store.leases.start(held)
             store.leases.report_progress(held, Progress(stage="sos", step=step, total=100, seconds=seconds))
         text = client.get("/metrics").text

@@ -19,6 +19,7 @@ from service.store import Store, open_store
 from service.store.jobs import NewJob
 from tests.api.service import Service
 from tests.postgres import fresh_database, is_installed, server
+from tests.service.store import helpers
 from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.slow
@@ -114,8 +115,7 @@ def test_all_pairs_of_operations_on_one_job(settings: ServiceSettings, tmp_path:
 
         def new_job() -> Job:
             row, _ = store.jobs.create(NewJob("local", "job", 0, {}, inputs), limit=10**6)
-            lease = store.leases.take("test")
-            assert lease is not None
+            lease = helpers.lease(store, "test")
             if chosen.random() < 0.25:  # a job that can be retried has no share, and its token opens nothing
                 store.leases.fail(lease, {"code": "internal", "message": "test"}, permanent=True)
                 return Job(client, store, row.id, "shr_" + "0" * 31, "shr_" + "0" * 31 + "." + "A" * 43)

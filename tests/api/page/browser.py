@@ -114,6 +114,18 @@ class Watched:
             return np.asarray(image.convert("RGB"), dtype=np.float64)
 
 
+def appear(*locators: Any) -> None:
+    """Wait until the page shows all of these."""
+    for locator in locators:
+        locator.wait_for()
+
+
+def click(*locators: Any) -> None:
+    """Click on these in turn."""
+    for locator in locators:
+        locator.click()
+
+
 def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
     """Render a scene file with `sgsst render`, [h, w, 3], 0 to 255."""
     loaded = read_scene(scene).scene

@@ -56,7 +56,19 @@ def cancel_all(service: Service) -> None:
                 client.post(f"{job['links']['self']}/cancel")
 
 
+def write(folder: Path) -> dict[str, Path]:
+    return dict(
+        zip(("scene", "cameras", "style"), write_files(folder, wall(sh_degree=1), cameras(3, 96, 72)), strict=True)
+    )
+
+
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
-    ply, file, style = write_files(tmp_path, wall(sh_degree=1), cameras(3, 96, 72))
-    return {"scene": ply, "cameras": file, "style": style}
+    """Return the paths of a small scene, its cameras and a style by their role."""
+    return write(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return the same for fixtures of a module, whose tests do not change them."""
+    return write(tmp_path_factory.mktemp("files"))

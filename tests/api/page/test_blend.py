@@ -20,7 +20,7 @@ from tests.api.page.browser import Watched, decoded, psnr, rendered
 from tests.api.page.test_page import frame_of
 from tests.api.page.test_viewer import FAITHFUL, real_scene, shown
 from tests.api.service import Service
-from tests.small_scenes import cameras, wall, write_files
+from tests.small_scenes import write_files
 
 pytestmark = pytest.mark.slow
 
@@ -68,15 +68,9 @@ def test_blend_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    ply, file, style = write_files(tmp_path_factory.mktemp("files"), wall(sh_degree=1), cameras(3, 96, 72))
-    return {"scene": ply, "cameras": file, "style": style}
-
-
-@pytest.fixture(scope="module")
-def pair(service: Service, files: dict[str, Path]) -> list[str]:
+def pair(service: Service, inputs: dict[str, Path]) -> list[str]:
     """Return the ids of two finished jobs of one scene."""
-    job_ids = [submit(service, files, name=f"run {weight}", content_weight=weight, **QUICK) for weight in (1, 900)]
+    job_ids = [submit(service, inputs, name=f"run {weight}", content_weight=weight, **QUICK) for weight in (1, 900)]
     return [done(service, each) for each in job_ids]
 
 
@@ -93,7 +87,7 @@ def saved(watched: Watched, folder: Path) -> Path:
     return path
 
 
-def test_slider_shows_what_is_saved(visit: Visit, files: dict[str, Path], pair: list[str], tmp_path: Path) -> None:
+def test_slider_shows_what_is_saved(visit: Visit, inputs: dict[str, Path], pair: list[str], tmp_path: Path) -> None:
     watched = visit(f"/#/jobs/{pair[0]}", width=600, height=500)
     page = watched.page
     page.get_by_label("Camera", exact=True).select_option("1")
@@ -103,7 +97,7 @@ def test_slider_shows_what_is_saved(visit: Visit, files: dict[str, Path], pair: 
     page.locator(".side.right", has_text="150% style").wait_for(state="attached")
     drawn, path = watched.pixels(), saved(watched, tmp_path)
     assert path.name == "run_1-stylized_1.5.ply"
-    camera = resized(read_cameras(files["cameras"])[1], 384)
+    camera = resized(read_cameras(inputs["cameras"])[1], 384)
     wanted = rendered(path, camera)
     assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered image
     assert np.abs(drawn - stylized).mean() > 5
@@ -137,7 +131,7 @@ def test_held_key_shows_the_original(visit: Visit, pair: list[str]) -> None:
 
 
 def test_two_results_are_blended(
-    visit: Visit, service: Service, files: dict[str, Path], pair: list[str], tmp_path: Path
+    visit: Visit, service: Service, inputs: dict[str, Path], pair: list[str], tmp_path: Path
 ) -> None:
     watched = visit(f"/#/compare/{pair[0]}/{pair[1]}", width=600, height=500)
     page = watched.page
@@ -153,7 +147,7 @@ def test_two_results_are_blended(
     paths = [tmp_path / f"{job_id}.ply" for job_id in pair]
     for job_id, file in zip(pair, paths, strict=True):
         file.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
-    expected = blend_scenes([read_scene(file) for file in (*paths, files["scene"])], [0.6, 0.2, 0.2])
+    expected = blend_scenes([read_scene(file) for file in (*paths, inputs["scene"])], [0.6, 0.2, 0.2])
     assert torch.allclose(read_scene(path).scene.sh_dc, expected.scene.sh_dc, atol=1e-6)
 
     area = page.locator(".triangle .area")

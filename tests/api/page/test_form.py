@@ -25,7 +25,7 @@ from tests.api.page.actions import (
     submit,
     write_selection,
 )
-from tests.api.page.browser import Watched
+from tests.api.page.browser import Watched, appear, click
 from tests.api.page.test_viewer import base_of
 from tests.api.service import Service, wait_for
 
@@ -65,8 +65,7 @@ def test_what_was_entered_survives_other_views(visit: Visit, files: dict[str, Pa
     page.locator("details.fold", has_text="Regions").evaluate("(fold) => { fold.open = true; }")
     page.get_by_role("button", name="Add a region").click()
     page.get_by_role("group", name="Region 1").get_by_label("Name").fill("left")
-    page.get_by_role("link", name="Jobs").click()
-    page.get_by_role("link", name="New", exact=True).click()
+    click(page.get_by_role("link", name="Jobs"), page.get_by_role("link", name="New", exact=True))
     for path in files.values():
         page.get_by_role("button", name=f"Remove {path.name}").wait_for()
     page.get_by_text("616 Gaussians · SH degree 1").wait_for()
@@ -80,8 +79,10 @@ def test_dropped_files_that_are_not_used_are_named(visit: Visit, files: dict[str
     notes.write_bytes(b"text")
     watched = visit()
     drop(watched, files | {"notes": notes})
-    watched.page.get_by_role("alert").get_by_text("Not used: notes.docx").wait_for()
-    watched.page.get_by_role("button", name="Remove scene.ply").wait_for()
+    appear(
+        watched.page.get_by_role("alert").get_by_text("Not used: notes.docx"),
+        watched.page.get_by_role("button", name="Remove scene.ply"),
+    )
     drop(watched, {"cameras": files["cameras"]})
     watched.page.get_by_text("Not used").wait_for(state="hidden")
 
@@ -180,8 +181,7 @@ def test_refusals_of_the_service_stand_at_their_place(visit: Visit, files: dict[
 
 
 def test_defaults_are_those_of_the_chosen_preset(visit: Visit) -> None:
-    watched = visit()
-    page = watched.page
+    page = visit().page
     resolution = page.locator("[data-name=resolution] input")
     resolution.wait_for()
     assert resolution.get_attribute("placeholder") == "fits the time"
@@ -215,8 +215,10 @@ def test_estimate_warns_and_can_be_stopped(visit: Visit, files: dict[str, Path])
     page.unroute_all(behavior="ignoreErrors")
     page.get_by_role("button", name="Estimate time").click()
     cost = page.get_by_role("region", name="Estimate")
-    cost.get_by_role("alert").get_by_text("region empty: ignored, because it has no Gaussians").wait_for()
-    cost.get_by_text("for the whole job").wait_for()
+    appear(
+        cost.get_by_role("alert").get_by_text("region empty: ignored, because it has no Gaussians"),
+        cost.get_by_text("for the whole job"),
+    )
 
 
 def test_ten_minutes_are_offered_for_a_long_job(visit: Visit, files: dict[str, Path]) -> None:
@@ -275,8 +277,7 @@ def test_another_painting_and_changes_send_nothing_again(
     watched = visit(f"/#/jobs/{before['id']}")
     page, sent = watched.page, uploads_of(watched)
     page.get_by_role("button", name="Try another painting").click()
-    page.get_by_role("button", name="Remove scene.ply").wait_for()
-    page.get_by_text("3 cameras shown in the scene").wait_for()
+    appear(page.get_by_role("button", name="Remove scene.ply"), page.get_by_text("3 cameras shown in the scene"))
     watched.settled()
     slot = page.locator(".slot", has_text="One painting")
     assert slot.locator(".thumb").count() == 0
@@ -316,8 +317,7 @@ def test_painting_of_a_region_is_not_one_of_the_job(
     labels = "async ([base, job]) => (await import(`${base}/names.js`)).labels([job])"
     assert page.evaluate(labels, [base_of(watched), before]) == ["style; the left: night"]
     page.get_by_role("button", name="Try another painting").click()
-    page.get_by_role("img", name="night.png").wait_for()
-    page.locator(".thumb", has_text="for the left").wait_for()
+    appear(page.get_by_role("img", name="night.png"), page.locator(".thumb", has_text="for the left"))
     row = page.get_by_role("group", name="Region 1")
     assert row.get_by_label("Strength").input_value() == "light"
     page.get_by_role("button", name="Start", exact=True).click()
@@ -382,12 +382,10 @@ def test_each_painting_can_be_a_job_of_its_own(
 
 def test_job_is_finished_early_on_the_page(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     job_id = submit(service, files, **LONG)
-    watched = visit(f"/#/jobs/{job_id}")
-    page = watched.page
+    page = visit(f"/#/jobs/{job_id}").page
     page.get_by_text("Adding detail · step").wait_for()
     page.get_by_role("button", name="Stop here and keep it").click()
-    page.locator(".badge", has_text="Done").wait_for()
-    page.get_by_role("link", name="Download", exact=True).wait_for()
+    appear(page.locator(".badge", has_text="Done"), page.get_by_role("link", name="Download", exact=True))
     assert httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["result"]["stopped"] == "on-request"
 
 
@@ -398,8 +396,7 @@ def test_paintings_are_chosen_from_the_gallery(visit: Visit, service: Service, f
     watched = visit(width=900, height=700)
     page, sent = watched.page, uploads_of(watched)
     choose(watched, {role: files[role] for role in ("scene", "cameras")})
-    page.locator("summary", has_text="Gallery").click()
-    page.get_by_role("button", name="Add style.png").click()
+    click(page.locator("summary", has_text="Gallery"), page.get_by_role("button", name="Add style.png"))
     page.get_by_role("button", name="Remove style.png").wait_for()
     page.get_by_role("button", name="Add The Great Wave off Kanagawa, Hokusai").click()
     page.get_by_role("button", name="Remove great_wave.jpg").wait_for()

@@ -27,7 +27,7 @@ from tests.api.page.actions import (
     set_options,
     submit,
 )
-from tests.api.page.browser import Watched, psnr, rendered
+from tests.api.page.browser import Watched, appear, click, psnr, rendered
 from tests.api.service import Service, wait_for
 from tests.small_scenes import ball, wall, write_files
 
@@ -57,11 +57,13 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.locator("canvas.view").evaluate("(canvas) => { canvas.id = 'same'; }")
     page.on("request", lambda request: sent.append(request.url))
     page.get_by_role("button", name="Start").click()
-    page.locator("h1", has_text="scene").wait_for()
-    page.locator(".badge", has_text="Done").wait_for()
-    page.get_by_role("img", name="Loss over time").wait_for()
-    page.get_by_role("heading", name="How it ran").wait_for()
-    page.get_by_label("Wipe", exact=True).wait_for()
+    appear(
+        page.locator("h1", has_text="scene"),
+        page.locator(".badge", has_text="Done"),
+        page.get_by_role("img", name="Loss over time"),
+        page.get_by_role("heading", name="How it ran"),
+        page.get_by_label("Wipe", exact=True),
+    )
     job_id = page.url.rsplit("/", 1)[1]
     assert page.locator("canvas.view").get_attribute("id") == "same", "the job's page shows the scene of the form"
     assert not [url for url in sent if url.endswith("/inputs/scene")]
@@ -121,8 +123,10 @@ def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[st
     page.get_by_role("button", name="Pause").wait_for()
     page.reload()  # while the routes are there, or the parts that hang would be sent
     page.unroute_all(behavior="ignoreErrors")
-    page.get_by_text(f"“big.ply” ({big.stat().st_size / 1e6:.1f} MB) was").wait_for()
-    page.get_by_text("Choose it again to finish").wait_for()
+    appear(
+        page.get_by_text(f"“big.ply” ({big.stat().st_size / 1e6:.1f} MB) was"),
+        page.get_by_text("Choose it again to finish"),
+    )
     (tmp_path / "elsewhere").mkdir()
     choose(watched, {"scene": large_scene(tmp_path / "elsewhere" / "big.ply", 20, 20)})
     page.locator(".notice").wait_for(state="hidden")
@@ -144,8 +148,7 @@ def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[st
     page.get_by_role("link", name="New", exact=True).click()
     set_options(watched, **LONG)
     choose(watched, files | {"scene": big})
-    page.get_by_role("button", name="Start").click()
-    page.get_by_role("button", name="Cancel").click()
+    click(page.get_by_role("button", name="Start"), page.get_by_role("button", name="Cancel"))
     page.locator(".badge", has_text="Canceled").wait_for()
     assert sent == []
 
@@ -165,8 +168,7 @@ def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_pat
     page.get_by_role("button", name="Pause").click()
     page.get_by_text("paused at 0%").wait_for()
     page.unroute_all(behavior="ignoreErrors")
-    page.get_by_role("button", name="Resume").click()
-    page.get_by_role("button", name="Cancel").click()
+    click(page.get_by_role("button", name="Resume"), page.get_by_role("button", name="Cancel"))
     page.locator(".badge", has_text="Canceled").wait_for()
 
 
@@ -174,8 +176,7 @@ def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str,
     """After a restart of the server, the event stream resumes where it stopped, and the loss history is complete."""
     job_id = submit(service, files, **LONG)
     page = visit(f"/#/jobs/{job_id}", allowed=["net::ERR", "Failed to load resource"]).page
-    page.get_by_text("Adding detail · step").wait_for()
-    page.get_by_role("img", name="Loss over time").wait_for()
+    appear(page.get_by_text("Adding detail · step"), page.get_by_role("img", name="Loss over time"))
     step = page.locator(".state").inner_text()
     wait_for(lambda: page.locator(".state").inner_text() != step, "news of the job: the stream is open", service.said)
     with service.killed("api.http.server"):
@@ -218,8 +219,7 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     watched = visit("/#/jobs")
     page = watched.page
     tiles = page.locator(".tile", has_text="of three")
-    tiles.nth(2).wait_for()
-    tiles.first.locator("img").wait_for()
+    appear(tiles.nth(2), tiles.first.locator("img"))
     page.get_by_label("Filter").fill("run 1 of three")
     page.locator(".tile", has_text="run 0 of three").wait_for(state="detached")
     page.get_by_label("Filter").fill("of three")
@@ -241,8 +241,7 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     delete.click()
     page.keyboard.press("Escape")
     assert delete.evaluate("(button) => button === document.activeElement")
-    delete.click()
-    page.get_by_role("button", name="Delete", exact=True).click()
+    click(delete, page.get_by_role("button", name="Delete", exact=True))
     page.locator(".tile", has_text="run 2 of three").wait_for(state="detached")
     assert page.locator(".tile a:focus").count() == 1, "the next job has the focus"
     assert httpx2.get(f"{service.url}/v1/jobs/{ids[2]}").status_code == 404
@@ -323,8 +322,7 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
             page.get_by_role("button", name="Sign in").click()
             page.get_by_role("button", name="Sign out").wait_for()
             assert page.evaluate("() => document.cookie + JSON.stringify({...localStorage, ...sessionStorage})") == "{}"
-        ann.page.locator(".tile", has_text="of ann").wait_for()
-        ben.page.get_by_text("No jobs yet").wait_for()
+        appear(ann.page.locator(".tile", has_text="of ann"), ben.page.get_by_text("No jobs yet"))
         ben.page.goto(f"{service.url}/#/jobs/{job_id}")
         ben.page.get_by_role("heading", name="This job doesn't exist").wait_for()
         ann.page.goto(f"{service.url}/#/jobs/{job_id}")
@@ -341,8 +339,7 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
         ann.page.get_by_role("link", name="New", exact=True).click()
         ann.page.get_by_role("button", name="Remove scene.ply").wait_for()
         ann.page.get_by_role("button", name="Sign out").click()
-        ann.page.locator("main").get_by_text("You signed out.").wait_for()
-        ann.page.get_by_label("API key").wait_for()
+        appear(ann.page.locator("main").get_by_text("You signed out."), ann.page.get_by_label("API key"))
         ann.page.reload()
         ann.page.get_by_label("API key").wait_for()
         ann.check("status of 401")
@@ -395,5 +392,7 @@ def shown(pixels: NDArray[np.float64]) -> int:
 
 def test_documentation_of_the_api_needs_no_internet(visit: Visit) -> None:
     watched = visit("/docs")
-    watched.page.get_by_text("/v1/jobs/{job_id}", exact=True).first.wait_for()
-    watched.page.get_by_text("/v1/jobs/{job_id}/events").first.wait_for()
+    appear(
+        watched.page.get_by_text("/v1/jobs/{job_id}", exact=True).first,
+        watched.page.get_by_text("/v1/jobs/{job_id}/events").first,
+    )

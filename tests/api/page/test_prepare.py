@@ -13,7 +13,7 @@ from PIL import Image
 
 from sgsst_core.files.scene_file import read_scene
 from tests.api.page.actions import REFUSED, STEPS, Visit, choose, done, set_options, started
-from tests.api.page.browser import Watched
+from tests.api.page.browser import Watched, appear, click
 from tests.api.service import Service
 from tests.sgsst_core.objects import box, joined, scene_of
 from tests.small_scenes import write_files
@@ -48,8 +48,7 @@ def test_example_is_one_click_from_a_job(visit: Visit, service: Service, files: 
     assert entered(watched) == ([], "", "standard")
     page.goto(f"{service.url}/#/jobs/{job['id']}")
     page.get_by_role("button", name="Same with changes").click()
-    page.get_by_role("button", name="Remove motorcycle.sog").wait_for()
-    page.locator(".presets input").first.wait_for()
+    appear(page.get_by_role("button", name="Remove motorcycle.sog"), page.locator(".presets input").first)
     choose(watched, {"scene": files["scene"], "style": files["style"]})
     assert entered(watched) == (["Remove scene.ply", "Remove style.png"], "", "standard")
 
@@ -97,16 +96,14 @@ def test_scene_is_turned_and_cropped(visit: Visit, service: Service, files: dict
     assert page.locator("[data-name=views]").is_hidden(), "an orbit has a number of views of its own"
     watched.settled()
     whole = from_first_camera(watched)
-    page.get_by_role("button", name="Show everything").click()
-    page.get_by_role("button", name="Crop the scene").click()
+    click(page.get_by_role("button", name="Show everything"), page.get_by_role("button", name="Crop the scene"))
     handle = page.get_by_role("button", name="Resize +Y")
     for _ in range(8):
         handle.press("ArrowUp")
         handle.press("ArrowLeft")
     page.get_by_role("button", name="Crop to this box").click()
     assert np.abs(from_first_camera(watched) - whole).mean() > 10, "the orbit surrounds what remains"
-    page.get_by_role("button", name="Show everything").click()
-    page.get_by_role("button", name="Turn the scene by 90°").click()
+    click(page.get_by_role("button", name="Show everything"), page.get_by_role("button", name="Turn the scene by 90°"))
     assert page.locator("[data-name=up] select").input_value() == "-x"
     page.get_by_role("button", name="Tip the scene by 90°").click()
     assert page.locator("[data-name=up] select").input_value() in ("z", "-z")
@@ -130,8 +127,7 @@ def test_scene_is_turned_and_cropped(visit: Visit, service: Service, files: dict
     watched.settled()
     crop = page.get_by_role("button", name="Crop the scene")
     assert crop.get_attribute("aria-pressed") == "true"
-    crop.click()
-    page.get_by_role("button", name="Remove the crop").click()
+    click(crop, page.get_by_role("button", name="Remove the crop"))
     assert crop.get_attribute("aria-pressed") == "false"
     assert page.get_by_role("group", name="Region").count() == 0
 
@@ -232,8 +228,10 @@ def test_unreadable_painting_is_used_as_it_is(visit: Visit, files: dict[str, Pat
 
 def edit(watched: Watched, name: str, button: str, edges: dict[str, str]) -> None:
     """Edit a painting in its dialog."""
-    watched.page.get_by_role("button", name=f"Rotate or crop {name}").click()
-    watched.page.get_by_role("button", name=button).click()
+    click(
+        watched.page.get_by_role("button", name=f"Rotate or crop {name}"),
+        watched.page.get_by_role("button", name=button),
+    )
     for edge, value in edges.items():
         watched.page.get_by_label(edge).fill(value)
     watched.page.get_by_role("button", name="Use it").click()

@@ -13,19 +13,17 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import RESULT_FORMATS, read_scene_header
 from sgsst_core.scene.camera import resized
 from tests.api.page.actions import LONG, STEPS, Visit, done, drop, submit
-from tests.api.page.browser import FLAGS, Watched, chromium, psnr, rendered
+from tests.api.page.browser import FLAGS, Watched, appear, chromium, click, psnr, rendered
 from tests.api.page.test_page import frame_of
 from tests.api.service import Service, wait_for
-from tests.small_scenes import cameras, wall, write_files
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def finished(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
+def finished(service: Service, inputs: dict[str, Path]) -> str:
     """Return the id of a finished job with default name."""
-    ply, file, style = write_files(tmp_path_factory.mktemp("files"), wall(sh_degree=1), cameras(3, 96, 72))
-    return done(service, submit(service, {"scene": ply, "cameras": file, "style": style}, **STEPS))
+    return done(service, submit(service, inputs, **STEPS))
 
 
 def test_result_is_downloaded_in_every_format(visit: Visit, finished: str, tmp_path: Path) -> None:
@@ -71,8 +69,7 @@ def test_chart_ends_with_the_loss_of_the_result(visit: Visit, service: Service, 
     assert points[-1]["mean_loss"] != points[-1]["loss"]
     watched = visit(f"/#/jobs/{finished}")
     legend = watched.page.locator(".legend")
-    legend.get_by_text("mean of all views").wait_for()
-    legend.get_by_text("single views").wait_for()
+    appear(legend.get_by_text("mean of all views"), legend.get_by_text("single views"))
     label = watched.page.get_by_role("img", name="Loss over time").get_attribute("aria-label")
     shown = float(label.split(" to ")[1].split(" in ")[0].replace(",", ""))
     assert shown == pytest.approx(job["result"]["loss_after"], rel=0.01)
@@ -186,8 +183,10 @@ def test_another_tab_sees_changes(visit: Visit, service: Service, files: dict[st
     here.page.get_by_role("button", name="Cancel").click()
     for watched in (here, there):
         watched.page.locator(".badge", has_text="Canceled").wait_for()
-    here.page.get_by_role("button", name=re.compile("Retry|Continue")).click()
-    there.page.get_by_role("button", name="Cancel").click()
+    click(
+        here.page.get_by_role("button", name=re.compile("Retry|Continue")),
+        there.page.get_by_role("button", name="Cancel"),
+    )
     for watched in (here, there):
         watched.page.locator(".badge", has_text="Canceled").wait_for()
     here.page.get_by_role("button", name="Rename").click()
@@ -196,8 +195,7 @@ def test_another_tab_sees_changes(visit: Visit, service: Service, files: dict[st
     there.page.get_by_role("heading", name="renamed here").wait_for()
     listed = visit("/#/jobs")
     listed.page.locator(".tile", has_text="renamed here").wait_for()
-    here.page.get_by_role("button", name="Delete").click()
-    here.page.get_by_role("button", name="Delete", exact=True).click()
+    click(here.page.get_by_role("button", name="Delete"), here.page.get_by_role("button", name="Delete", exact=True))
     there.page.get_by_role("heading", name="This job was deleted.").wait_for()
     listed.page.locator(".tile", has_text="renamed here").wait_for(state="detached")
     there.page.reload()
@@ -232,8 +230,7 @@ def test_page_without_webgl_has_the_sheet_and_the_form(
 def test_video_is_made_and_played(visit: Visit, service: Service, finished: str) -> None:
     from axe_playwright_python.sync_playwright import Axe
 
-    watched = visit(f"/#/jobs/{finished}", allowed=["net::ERR"], width=360, height=800)
-    page = watched.page
+    page = visit(f"/#/jobs/{finished}", allowed=["net::ERR"], width=360, height=800).page
     page.get_by_label("Camera path").select_option("cameras")
     page.get_by_label("Length").select_option("4")
     page.get_by_label("Start with the original").check()
@@ -268,8 +265,7 @@ def test_video_is_made_and_played(visit: Visit, service: Service, finished: str)
         assert len(list(container.decode(video=0))) == 120
     assert Axe().run(page).violations_count == 0
     page.reload()
-    page.get_by_label("Video of the result").wait_for()
-    page.get_by_role("button", name="Make another video").wait_for()
+    appear(page.get_by_label("Video of the result"), page.get_by_role("button", name="Make another video"))
 
 
 def watch(visit: Visit, job_id: str) -> Watched:

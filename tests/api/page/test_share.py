@@ -29,16 +29,13 @@ _FRAMES = """(most) => new Promise((done) => {
 
 
 @pytest.fixture(scope="module")
-def job_id(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
+def job_id(service: Service, inputs: dict[str, Path]) -> str:
     """Return the id of a finished job."""
-    ply, file, style = write_files(tmp_path_factory.mktemp("files"), wall(sh_degree=1), cameras(3, 96, 72))
-    files = {"scene": ply, "cameras": file, "style": style}
-    return done(service, submit(service, files, **(STEPS | {"steps_sos": 2}), name="my wall", retention_days=2))
+    return done(service, submit(service, inputs, **(STEPS | {"steps_sos": 2}), name="my wall", retention_days=2))
 
 
 def test_link_shows_viewer_and_wipe_until_it_is_revoked(visit: Visit, service: Service, job_id: str) -> None:
-    watched = visit(f"/#/jobs/{job_id}")
-    page = watched.page
+    page = visit(f"/#/jobs/{job_id}").page
     page.get_by_label("Link expires after").select_option("1")
     page.get_by_role("button", name="Create a link").click()
     page.get_by_role("button", name="Revoke").wait_for()

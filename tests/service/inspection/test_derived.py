@@ -40,6 +40,7 @@ from sgsst_core.scene.camera import resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.service import PATIENCE
 from tests.raised import raises_problem
+from tests.service.store import helpers
 from tests.service.store.helpers import usage_of
 from tests.sgsst_core.objects import figure, joined, moved
 from tests.small_scenes import cameras, wall, write_files
@@ -67,8 +68,7 @@ class Stored:
             self.blobs.add(path, link=True)
             inputs.append({"role": role, "name": path.name, "sha256": sha256, "size": size})
         job, _ = self.store.jobs.create(NewJob(owner, "job", 0, {}, inputs), limit=1)
-        lease = self.store.leases.take("test")
-        assert lease is not None
+        lease = helpers.lease(self.store, "test")
         result = self.artifacts.put(job.id, lease.epoch, RESULT, files["scene"])
         self.store.leases.succeed(lease, [result], {})
         return self.store.jobs.get(job.id, owner)

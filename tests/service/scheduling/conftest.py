@@ -7,9 +7,9 @@ import pytest
 
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.jobs import NewJob
 from service.store.queue import Lease
-from tests.service.store.helpers import SHA
+from tests.service.store import helpers
+from tests.service.store.helpers import SHA, queue
 from tests.stores import new_store
 
 
@@ -33,8 +33,5 @@ def lease(store: Store) -> Lease:
 
 def new_lease(store: Store, dispatcher: str = "one") -> Lease:
     """Create a job, and return its lease."""
-    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
-    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=100)
-    taken = store.leases.take(dispatcher)
-    assert taken is not None
-    return taken
+    queue(store)
+    return helpers.lease(store, dispatcher)

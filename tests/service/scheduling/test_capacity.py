@@ -1,6 +1,6 @@
 """Tests of how jobs share a machine's GPUs, with a real database and simulated machines."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -141,16 +141,12 @@ def test_number_of_jobs_is_limited_by_parallel_jobs(tmp_path: Path) -> None:
 
 def test_gpu_jobs_wait_for_host_memory() -> None:
     capacity = Capacity(machine(8), None)
-    alone = capacity.grant(job(200 * GB, workers=1), [], 1)
-    assert alone is not None, "were it too big: it may try"
+    alone = granted(capacity, job(200 * GB, workers=1), waiting=1)  # were it too big: it may try
     assert alone.host_bytes == 3 * GB + 400 * GB
-    first = capacity.grant(job(20 * GB, workers=4), [], 9)
-    assert first is not None
+    first = granted(capacity, job(20 * GB, workers=4))
     assert first.host_bytes == 4 * 3 * GB + 40 * GB
     assert capacity.grant(job(15 * GB, workers=1), [first], 9) is None, "52 + 33 GB are more than four fifths of 100 GB"
-    second = capacity.grant(job(10 * GB, workers=1), [first], 9)
-    assert second is not None
-    assert second.gpus == ("gpu4",)
+    assert granted(capacity, job(10 * GB, workers=1), [first]).gpus == ("gpu4",)
 
 
 @given(st.lists(st.tuples(st.integers(1, 60 * GB), st.integers(1, 8)), max_size=12))
@@ -178,6 +174,12 @@ def test_one_job_at_a_time_runs_without_gpus(tmp_path: Path) -> None:
     queue.store.close()
 
 
+def granted(capacity: Capacity, wanted: JobRow, held: Sequence[Grant] = (), waiting: int = 9) -> Grant:
+    grant = capacity.grant(wanted, [*held], waiting)
+    assert grant is not None
+    return grant
+
+
 def job(scene: int, **parameters: Any) -> JobRow:
     inputs = [{"role": "scene", "size": scene}, {"role": "style", "size": 10**12}]
     return JobRow(id="job", parameters=parameters, inputs=inputs)
@@ -197,20 +199,16 @@ def job(scene: int, **parameters: Any) -> JobRow:
     ],
 )
 def test_larger_jobs_get_more_gpus(parameters: dict[str, Any], ranks: int) -> None:
-    grant = Capacity(machine(8), None).grant(job(GB, **parameters), [], 1)
-    assert grant is not None
-    assert grant.ranks == ranks
+    assert granted(Capacity(machine(8), None), job(GB, **parameters), waiting=1).ranks == ranks
 
 
 def test_gpus_do_not_depend_on_the_format() -> None:
     capacity = Capacity(machine(8), None)
-    plain = capacity.grant(job(248_000_000, precision="float32"), [], 1)
+    plain = granted(capacity, job(248_000_000, precision="float32"), waiting=1)
     for name, scene in (("s.compressed.ply", 61_000_000), ("s.SPZ", 25_000_000), ("s.splat", 32_000_000)):
         inputs = [{"role": "scene", "name": name, "size": scene}]
-        grant = capacity.grant(JobRow(id="job", parameters={"precision": "float32"}, inputs=inputs), [], 1)
-        assert grant
-        assert plain
-        assert grant.ranks == plain.ranks
+        packed = JobRow(id="job", parameters={"precision": "float32"}, inputs=inputs)
+        assert granted(capacity, packed, waiting=1).ranks == plain.ranks
 
 
 def test_memory_limit_of_a_single_job_is_at_most_its_fraction_of_the_machine() -> None:
@@ -226,17 +224,13 @@ def test_memory_of_a_cluster_is_not_packed() -> None:
 
 def test_slots_are_fractions_of_cores_and_memory() -> None:
     capacity = Capacity(machine(0), 4)
-    small = capacity.grant(job(GB), [], 9)
-    assert small is not None
-    assert (small.slots, small.threads) == (1, 4)
-    assert small.memory == 20 * GB - 4 * GB
-    large = capacity.grant(job(8 * GB), [small], 9)
-    assert large is not None
+    small = granted(capacity, job(GB))
+    assert (small.slots, small.threads, small.memory) == (1, 4, 20 * GB - 4 * GB)
+    large = granted(capacity, job(8 * GB), [small])
     assert (large.slots, large.threads) == (2, 8)
     assert capacity.free([small, large]) == 1
     assert capacity.grant(job(8 * GB), [small, large], 9) is None, "two slots are needed, and one is free"
-    asked = capacity.grant(job(GB, memory_limit=3 * GB), [small, large], 9)
-    assert asked is not None
+    asked = granted(capacity, job(GB, memory_limit=3 * GB), [small, large])
     assert (asked.slots, asked.memory) == (1, 3 * GB)
     assert capacity.grant(job(1), [small, large, asked], 9) is None
 

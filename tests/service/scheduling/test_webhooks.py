@@ -33,6 +33,7 @@ from service.store.jobs import NewJob
 from service.store.tables import DeliveryRow
 from sgsst_core.progress import Progress
 from tests.http_servers import Answer, LocalServer, send
+from tests.service.store import helpers
 from tests.service.store.helpers import Clock
 from tests.stores import migrated_database, new_store
 
@@ -162,8 +163,7 @@ def test_chosen_events_are_sent_and_progress_does_not_queue_up(
     choices: tuple[list[WebhookEvent] | None, ...] = (["started", "progress", "completed"], ["started"], None)
     for events in choices:
         store.jobs.create(NewJob("local", "wall", 0, {}, inputs, receiver.url, events), limit=1000)
-        lease = store.leases.take("one")
-        assert lease is not None
+        lease = helpers.lease(store)
         store.leases.start(lease)
         for step in (1, 2, 3):
             progress = Progress(stage="sos", step=step, total=9)
