@@ -94,3 +94,8 @@ def write_files(folder: Path, scene: Scene | None = None, views: list[Camera] | 
     file.write_text(json.dumps(entries))
     Image.fromarray((style() * 255).to(torch.uint8).numpy()).save(image)
     return ply, file, image
+
+
+def input_files(folder: Path, scene: Scene | None = None, views: list[Camera] | None = None) -> dict[str, Path]:
+    """Write these files, and return their paths by their role in a job."""
+    return dict(zip(("scene", "cameras", "style"), write_files(folder, scene, views), strict=True))

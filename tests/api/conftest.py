@@ -10,7 +10,7 @@ import pytest
 from api.cli.main import main
 from service.store import Store
 from tests.api.service import Service, wait_for
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import input_files
 
 #: Function that returns a running service with these settings, which tests of other files use too.
 Services = Callable[..., Service]
@@ -73,7 +73,7 @@ def whole_service(services: Services) -> Iterator[Service]:
 @pytest.fixture(scope="package")
 def paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Return the paths of a small scene, its cameras and a style by their role, which tests do not change."""
-    return dict(zip(("scene", "cameras", "style"), write_files(tmp_path_factory.mktemp("inputs"), wall()), strict=True))
+    return input_files(tmp_path_factory.mktemp("inputs"))
 
 
 @pytest.fixture(scope="module")

@@ -162,7 +162,10 @@ class Service:
         """Wait until a job has ended, and return it; fail if it has not succeeded."""
 
         def ended() -> dict[str, Any] | None:
-            job: dict[str, Any] = httpx2.get(f"{self.url}/v1/jobs/{job_id}", timeout=60, verify=False).json()
+            try:
+                job: dict[str, Any] = httpx2.get(f"{self.url}/v1/jobs/{job_id}", timeout=60, verify=False).json()
+            except httpx2.TransportError:  # a test has killed the API, which is started again
+                return None
             return job if job["status"] in ("succeeded", "failed", "canceled") else None
 
         job: dict[str, Any] = wait_for(ended, f"the end of {job_id}", self.said)

@@ -24,7 +24,7 @@ from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from tests.api.service import ROOT, Service, undisturbed, wait_for
 from tests.api.service import submit as submit_job
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import input_files, wall
 
 #: Enough steps to be killed during a job, and enough to see a job run.
 STEPS, FEW_STEPS = 600, 150
@@ -33,8 +33,7 @@ PARAMETERS = {"preset": "standard", "steps_sos": STEPS, "backbone": "vgg16", "ea
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall(sh_degree=1))
-    return {"scene": ply, "cameras": cameras, "style": style}
+    return input_files(tmp_path_factory.mktemp("inputs"), wall(sh_degree=1))
 
 
 @pytest.fixture(scope="module")
@@ -344,10 +343,7 @@ def test_dry_run_plans_without_queueing_and_its_job_reuses_the_plan(
     assert answer.status_code == 200, answer.text
     plan = answer.json()
     assert (plan["gaussians"], plan["views"], plan["sh_degree"]) == (616, 3, 1)
-    assert plan["plan"]["decisions"]
-    assert plan["estimated_seconds"] > 0
-    assert plan["memory_bytes"] > 0
-    assert plan["device_memory_bytes"] is None
+    assert (plan["memory_bytes"] > 0, plan["device_memory_bytes"]) == (True, None)
     assert len(client.get("/v1/jobs").json()["jobs"]) == before
     job_id = submit(client, files, steps_sos=5)
     wait_until(service, client, job_id, "succeeded")

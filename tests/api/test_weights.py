@@ -10,7 +10,6 @@ import pytest
 
 from tests.api.http.sending import refused
 from tests.api.service import Service, wait_for
-from tests.small_scenes import wall, write_files
 
 PARAMETERS = {"preset": "standard", "steps_sos": 3, "backbone": "vgg16", "early_stop": False}
 
@@ -41,10 +40,8 @@ def flip_a_bit(path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_damaged_weights_block_jobs(cache: Path, tmp_path: Path) -> None:
+def test_damaged_weights_block_jobs(cache: Path, paths: dict[str, Path], tmp_path: Path) -> None:
     """A job waits if the service starts with damaged weights. Once they are repaired, it runs without a restart."""
-    scene, cameras, style = write_files(tmp_path, wall())
-    paths = {"scene": scene, "cameras": cameras, "style": style}
     files = {role: (path.name, path.read_bytes()) for role, path in paths.items()}
     data, weights = tmp_path / "data", cache / "vgg16.safetensors"
     sound = tmp_path / "sound"

@@ -19,7 +19,7 @@ from tests.api.service import submit as submit_job
 from tests.postgres import fresh_database
 from tests.service.conftest import postgres  # noqa: F401 (a fixture)
 from tests.service.files.s3 import environment_of, s3_server
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import input_files
 
 pytestmark = pytest.mark.slow
 #: The job has to run for longer than two backups take, even on a busy machine.
@@ -53,7 +53,7 @@ def backup(environment: dict[str, str], *words: str | Path) -> subprocess.Comple
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return dict(zip(("scene", "cameras", "style"), write_files(tmp_path_factory.mktemp("in"), wall()), strict=True))
+    return input_files(tmp_path_factory.mktemp("in"))
 
 
 @pytest.fixture(scope="module")

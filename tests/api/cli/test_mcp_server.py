@@ -20,15 +20,13 @@ from PIL import Image
 from api.client import AsyncClient
 from service.inputs import JobParameters
 from tests.api.service import ROOT, Service
-from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
-    return {"scene": str(ply), "cameras": str(cameras), "style": str(style)}
+def files(paths: dict[str, Path]) -> dict[str, str]:
+    return {role: str(path) for role, path in paths.items()}
 
 
 @pytest.fixture(scope="module")

@@ -196,13 +196,3 @@ def test_cameras_that_hardly_show_the_scene_are_refused_if_asked(
     )
     assert "of the Gaussians in its frame" in refused.json()["detail"]
     assert jobs(client) == before
-
-
-def test_orbit_surrounds_what_a_crop_leaves(client: httpx2.Client, files: dict[str, bytes]) -> None:
-    without = {role: content for role, content in files.items() if role != "cameras"}
-    crop = [{"name": "inside", "select": "box=-1,-1,2,0,0,4"}, {"name": "rest", "freeze": True}]
-    plans = [client.post("/v1/jobs", **request(without, orbit=2, **more)).json() for more in ({}, {"regions": crop})]
-    whole, cropped = (
-        next(each["decision"] for each in plan["plan"]["decisions"] if each["item"] == "cameras") for plan in plans
-    )
-    assert float(cropped.split()[-4]) < 0.8 * float(whole.split()[-4])

@@ -1,6 +1,5 @@
 """Tests of the service behind nginx, at the root of a host and at a subpath."""
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,11 +11,10 @@ import httpx2
 import pytest
 
 from tests.api.conftest import Services
+from tests.api.http.sending import TUS, form
 from tests.api.service import Service
 from tests.nginx import Nginx
-from tests.small_scenes import wall, write_files
 
-TUS = {"Tus-Resumable": "1.0.0"}
 #: Client without certificates, which take time to load.
 PLAIN = httpx2.Client(verify=False, timeout=60)
 FORWARDED = ("proxy_set_header X-Forwarded-Prefix /tools/paint;",)
@@ -56,15 +54,6 @@ def port_of(service: Service) -> int:
     return int(service.url.rpartition(":")[2])
 
 
-def job_form(folder: Path) -> dict[str, Any]:
-    paths = dict(zip(("scene", "cameras", "style"), write_files(folder, wall()), strict=True))
-    parameters = {"preset": "preview", "resolution": 48, "steps_coarse": 1, "steps_sos": 1}
-    return {
-        "files": {role: (path.name, path.read_bytes()) for role, path in paths.items()},
-        "data": {"parameters": json.dumps(parameters)},
-    }
-
-
 def test_pages_and_their_files_are_found(proxy: Proxy) -> None:
     for page in ("/", "/docs", "/shared"):
         answer = PLAIN.get(proxy.url + page)
@@ -80,12 +69,12 @@ def test_pages_and_their_files_are_found(proxy: Proxy) -> None:
     assert servers == ([{"url": proxy.subpath}] if proxy.subpath else [])
 
 
-def test_addresses_lead_through_the_proxy(proxy: Proxy, tmp_path: Path) -> None:
+def test_addresses_lead_through_the_proxy(proxy: Proxy, files: dict[str, bytes]) -> None:
     created = PLAIN.post(f"{proxy.url}/v1/uploads", headers={**TUS, "Upload-Length": "10"})
     where = urljoin(proxy.url, created.headers["location"])
     assert where.startswith(f"{proxy.url}/v1/uploads/")
     assert PLAIN.head(where, headers=TUS).headers["upload-offset"] == "0"
-    answer = PLAIN.post(f"{proxy.url}/v1/jobs", **job_form(tmp_path), timeout=60)
+    answer = PLAIN.post(f"{proxy.url}/v1/jobs", files=form(files), timeout=60)
     job = answer.json()
     assert answer.headers["location"] == job["links"]["self"]
     assert PLAIN.get(urljoin(proxy.url, job["links"]["self"])).json()["id"] == job["id"]

@@ -9,7 +9,7 @@ import pytest
 
 from tests.api.page.browser import Watched, missing, open_browser
 from tests.api.service import Service
-from tests.small_scenes import cameras, wall, write_files
+from tests.small_scenes import cameras, input_files, wall
 
 
 @pytest.fixture(scope="package")
@@ -56,19 +56,13 @@ def cancel_all(service: Service) -> None:
                 client.post(f"{job['links']['self']}/cancel")
 
 
-def write(folder: Path) -> dict[str, Path]:
-    return dict(
-        zip(("scene", "cameras", "style"), write_files(folder, wall(sh_degree=1), cameras(3, 96, 72)), strict=True)
-    )
-
-
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
     """Return the paths of a small scene, its cameras and a style by their role."""
-    return write(tmp_path)
+    return input_files(tmp_path, wall(sh_degree=1), cameras(3, 96, 72))
 
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Return the same for fixtures of a module, whose tests do not change them."""
-    return write(tmp_path_factory.mktemp("files"))
+    return input_files(tmp_path_factory.mktemp("files"), wall(sh_degree=1), cameras(3, 96, 72))

@@ -96,6 +96,18 @@ def fill_the_screen(watched: Watched) -> None:
     page.locator(".stage:not(:fullscreen)").wait_for()
 
 
+def change(page: Any, job_id: str, members: dict[str, Any]) -> None:
+    """Change members of a job, and of all listed ones, in the answers that the page gets."""
+
+    def answer(route: Any) -> None:
+        content = route.fetch().json()
+        jobs = [job | members for job in content.get("jobs", [])]
+        route.fulfill(json={**content, "jobs": jobs} if jobs else content | members)
+
+    page.route(f"**/v1/jobs/{job_id}", answer)
+    page.route("**/v1/jobs?*", answer)
+
+
 @pytest.mark.parametrize(
     ("stage", "views", "text"),
     [
@@ -109,17 +121,9 @@ def test_stages_beside_steps_count_their_own_views(
     """The survey's own remaining time, which ends at 0, is not that of the job, and its views are not steps."""
     status = "running" if stage == "measuring" else "starting"
     checked = {"views_checked": 3, "views_to_check": 8} if stage == "measuring" else {}
-    changed = {"status": status, "progress": {"stage": stage, **views, **checked}}
-
-    def change(route: Any) -> None:
-        content = route.fetch().json()
-        jobs = [job | changed for job in content.get("jobs", [])]
-        route.fulfill(json={**content, "jobs": jobs} if jobs else content | changed)
-
     watched = visit("/#/jobs")
     page = watched.page
-    page.route(f"**/v1/jobs/{finished}", change)
-    page.route("**/v1/jobs?*", change)
+    change(page, finished, {"status": status, "progress": {"stage": stage, **views, **checked}})
     page.route(f"**/v1/jobs/{finished}/events", lambda route: None)  # its events are those of the real job
     page.goto(f"{watched.url}/#/jobs/{finished}")
     page.get_by_text(text, exact=True).wait_for()
@@ -154,18 +158,10 @@ def test_stages_beside_steps_count_their_own_views(
     ],
 )
 def test_job_that_did_little_is_not_just_done(visit: Visit, finished: str, result: dict[str, Any], text: str) -> None:
-    def change(route: Any) -> None:
-        content = route.fetch().json()
-        jobs = [job | {"result": {**result, "loss_before": 100.0}} for job in content.get("jobs", [])]
-        route.fulfill(
-            json={**content, "jobs": jobs} if jobs else content | {"result": {**result, "loss_before": 100.0}}
-        )
-
     watched = visit("/#/jobs")
     page = watched.page
     page.get_by_role("link", name="Jobs").wait_for()
-    page.route(f"**/v1/jobs/{finished}", change)
-    page.route("**/v1/jobs?*", change)
+    change(page, finished, {"result": {**result, "loss_before": 100.0}})
     page.goto(f"{watched.url}/#/jobs/{finished}")
     page.locator(".badge", has_text="Done").wait_for()
     assert page.locator(".warnings").inner_text() == text

@@ -23,6 +23,7 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.files import InputRows
 from service.store.tables import BlobRow, UploadRow
+from tests.api.http.sending import TUS, begin, refused, send
 from tests.api.service import Service
 from tests.raised import raises_problem
 from tests.service.files.s3 import Fault, FaultyS3, environment_of, s3_server
@@ -315,7 +316,6 @@ def test_only_a_full_disk_counts_as_no_space(path: str, flags: str, error: type[
         write_all(file, b"bytes")
 
 
-TUS = {"Tus-Resumable": "1.0.0"}
 #: User id without rights.
 _NOBODY = 65534
 
@@ -327,17 +327,16 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         yield running
 
 
-def append(service: Service, where: str, offset: int, content: bytes, checksum: str = "") -> httpx2.Response:
-    headers = {**TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream"}
-    headers |= {"Upload-Checksum": checksum} if checksum else {}
-    return httpx2.patch(f"{service.url}{where}", content=content, headers=headers, timeout=60)
+@pytest.fixture(scope="module")
+def client(service: Service) -> Iterator[httpx2.Client]:
+    with service.client() as opened:
+        yield opened
 
 
-def begin(service: Service, content: bytes) -> str:
+def almost(client: httpx2.Client, content: bytes) -> str:
     """Create an upload with all bytes except the last one, and return its URL path."""
-    headers = {**TUS, "Upload-Length": str(len(content))}
-    where = str(httpx2.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
-    assert append(service, where, 0, content[:-1]).status_code == 204
+    where = begin(client, len(content))
+    assert send(client, where, 0, content[:-1]).status_code == 204
     return where
 
 
@@ -356,30 +355,29 @@ def write_the_end(service: Service, content: bytes, where: str, *, linked: bool)
 
 
 @pytest.mark.slow
-def test_last_part_can_be_sent_again(service: Service) -> None:
+def test_last_part_can_be_sent_again(service: Service, client: httpx2.Client) -> None:
     contents = {linked: os.urandom(10_000) for linked in (False, True)}
-    places = {linked: begin(service, content) for linked, content in contents.items()}
+    places = {linked: almost(client, content) for linked, content in contents.items()}
     service.stop(signal.SIGKILL)
     for linked, content in contents.items():
         write_the_end(service, content, places[linked], linked=linked)
     service.start()
     for linked, content in contents.items():
         where, sha256 = places[linked], hashlib.sha256(content).hexdigest()
-        assert httpx2.head(f"{service.url}{where}", headers=TUS).headers["upload-offset"] == str(len(content))
-        assert append(service, where, len(content), b"").status_code == 204
-        shown = httpx2.get(f"{service.url}{where}").json()
+        assert client.head(where, headers=TUS).headers["upload-offset"] == str(len(content))
+        assert send(client, where, len(content), b"").status_code == 204
+        shown = client.get(where).json()
         assert (shown["complete"], shown["sha256"]) == (True, sha256)
     blobs = [path.read_bytes() for path in (service.data / "blobs").glob("*/*") if path.is_file()]
     assert [blobs.count(content) for content in contents.values()] == [1, 1]
     assert not any((service.data / "uploads").iterdir())
 
 
-def test_missing_bytes_are_not_read_as_zeros(service: Service) -> None:
-    where = begin(service, os.urandom(10_000))
+def test_missing_bytes_are_not_read_as_zeros(service: Service, client: httpx2.Client) -> None:
+    where = almost(client, os.urandom(10_000))
     part = service.data / "uploads" / f"{where.rsplit('/', 1)[1]}.part"
     part.unlink()
-    answer = append(service, where, 9_999, b"x")
-    assert (answer.status_code, answer.json()["code"]) == (404, "not-found")
+    refused(send(client, where, 9_999, b"x"), 404, "not-found")
 
 
 @contextmanager
@@ -432,18 +430,18 @@ def test_missing_write_permission_is_a_failure_of_the_store(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_digest_of_an_upload_in_parts_equals_that_of_its_file(service: Service, killed: bool) -> None:
+def test_digest_of_an_upload_in_parts_equals_that_of_its_file(
+    service: Service, client: httpx2.Client, killed: bool
+) -> None:
     content = os.urandom(30_000)
-    middle = len(content) // 2
-    headers = {**TUS, "Upload-Length": str(len(content))}
-    where = str(httpx2.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
-    assert append(service, where, 0, content[:middle]).status_code == 204
+    middle, where = len(content) // 2, begin(client, len(content))
+    assert send(client, where, 0, content[:middle]).status_code == 204
     wrong = base64.b64encode(hashlib.sha256(b"another").digest()).decode()
-    assert append(service, where, middle, bytes(100), f"sha256 {wrong}").status_code == 460
+    refused(send(client, where, middle, bytes(100), **{"Upload-Checksum": f"sha256 {wrong}"}), 460, "checksum-mismatch")
     if killed:  # the digest so far is lost
         service.stop(signal.SIGKILL)
         service.start()
-    assert append(service, where, middle, content[middle:-1]).status_code == 204
-    assert append(service, where, len(content) - 1, content[-1:]).status_code == 204
-    shown = httpx2.get(f"{service.url}{where}").json()
+    assert send(client, where, middle, content[middle:-1]).status_code == 204
+    assert send(client, where, len(content) - 1, content[-1:]).status_code == 204
+    shown = client.get(where).json()
     assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(content).hexdigest())

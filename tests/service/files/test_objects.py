@@ -18,7 +18,7 @@ from service.files.objects import Artifacts, FileCache, ObjectStore
 from service.problems import DamagedFileError, LostFileError, NoSpaceError, StoreError
 from tests.api.service import Service, submit, undisturbed
 from tests.service.files.s3 import environment_of, s3_server
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import input_files
 
 
 @pytest.fixture(params=["file", "memory"])
@@ -315,8 +315,7 @@ def dispatcher(data: Path, environment: dict[str, str]) -> Iterator[None]:
 def test_api_and_dispatcher_share_a_bucket_and_no_folder(
     environment: dict[str, str], tmp_path: Path, tiny_installed: Path
 ) -> None:
-    ply, cameras, style = write_files(tmp_path, wall())
-    files = {"scene": ply, "cameras": cameras, "style": style}
+    files = input_files(tmp_path)
     parameters = {"preset": "standard", "steps_sos": 4, "backbone": "vgg16", "early_stop": False, "seed": 1}
     expected = undisturbed(files, parameters, tmp_path).read_bytes()
     shared = {"SGSST_ARTIFACTS": "s3://results/service", "SGSST_DATABASE": f"sqlite:///{tmp_path / 'shared.db'}"}

@@ -43,7 +43,7 @@ from tests.raised import raises_problem
 from tests.service.store import helpers
 from tests.service.store.helpers import usage_of
 from tests.sgsst_core.objects import figure, joined, moved
-from tests.small_scenes import cameras, wall, write_files
+from tests.small_scenes import cameras, input_files, wall, write_files
 from worker.derived import video_cameras, viewpoint_of
 from worker.inputs import read_job_capture
 from worker.options import JobVideo
@@ -61,7 +61,7 @@ class Stored:
     def finished(self, owner: str, folder: Path) -> JobRow:
         """Return a finished job, whose scene is also its result."""
         (folder / owner).mkdir()
-        files = dict(zip(("scene", "cameras", "style"), write_files(folder / owner, wall()), strict=True))
+        files = input_files(folder / owner)
         inputs = []
         for role, path in files.items():
             size, sha256 = path.stat().st_size, hashlib.sha256(path.read_bytes()).hexdigest()

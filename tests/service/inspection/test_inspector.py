@@ -26,7 +26,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.files.scene_file import write_scene
 from tests.api.service import PATIENCE
 from tests.raised import raises_problem
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import input_files, wall
 from worker.inputs import check_frames_have_sizes
 
 
@@ -175,8 +175,7 @@ def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, An
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
-    scene, cameras, style = write_files(tmp_path, wall())
-    return {"scene": scene, "cameras": cameras, "style": style}
+    return input_files(tmp_path)
 
 
 def large(path: Path, side: int) -> Path:

@@ -27,7 +27,7 @@ from service.store import open_store
 from tests.api.service import PATIENCE
 from tests.service.inspection import attack
 from tests.service.inspection.test_inspector import Inspect, inspecting
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import input_files
 
 COMPROMISED = Path(__file__).with_name("compromised.py")
 #: Variables set for the libraries and by `sgsst_core`; Python itself adds LC_CTYPE if there is no locale.
@@ -39,8 +39,8 @@ pytestmark = pytest.mark.skipif(bool(sandbox.missing()), reason=f"the kernel lac
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
     """Return files with a name of their own, so that findings about those of another test are not reused."""
-    scene, cameras, style = write_files(tmp_path, wall())
-    return {"scene": scene.rename(tmp_path / f"{secrets.token_hex(4)}.ply"), "cameras": cameras, "style": style}
+    files = input_files(tmp_path)
+    return files | {"scene": files["scene"].rename(tmp_path / f"{secrets.token_hex(4)}.ply")}
 
 
 @contextmanager

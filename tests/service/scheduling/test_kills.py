@@ -16,7 +16,7 @@ import torch
 
 from sgsst_core.files.scene_file import read_scene
 from tests.api.service import Service, undisturbed, wait_for
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import input_files
 
 STEPS = 600
 PARAMETERS = {"preset": "standard", "steps_sos": STEPS, "backbone": "vgg16", "early_stop": False, "seed": 5}
@@ -27,8 +27,7 @@ ATTEMPT, API, DISPATCHER = "service.scheduling.attempt_process", "api.http.serve
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
-    return {"scene": ply, "cameras": cameras, "style": style}
+    return input_files(tmp_path_factory.mktemp("inputs"))
 
 
 @pytest.fixture(scope="module")
@@ -66,18 +65,6 @@ def look(service: Service, job_id: str) -> dict[str, Any]:
     return content
 
 
-def ended(service: Service, job_id: str) -> dict[str, Any]:
-    """Wait until the job has ended, and return its status; fail if it has not succeeded."""
-
-    def there() -> dict[str, Any] | None:
-        job = look(service, job_id)
-        return job if job["status"] in ("succeeded", "failed", "canceled") else None
-
-    job: dict[str, Any] = wait_for(there, f"the end of {job_id}", service.said)
-    assert job["status"] == "succeeded", job["error"]
-    return job
-
-
 def at_step(service: Service, job_id: str, step: int, attempt: int) -> None:
     """Wait until an attempt has reached a step, or until the job has ended."""
 
@@ -93,9 +80,8 @@ def at_step(service: Service, job_id: str, step: int, attempt: int) -> None:
 
 def check_published_once(service: Service, job_id: str) -> bytes:
     """Return the job's result; fail unless it was announced, ended the job and was stored exactly once."""
-    stream = httpx2.get(f"{service.url}/v1/jobs/{job_id}/events", timeout=60).text
-    blocks = [dict(line.split(": ", 1) for line in block.splitlines()) for block in stream.split("\n\n") if block]
-    events = [(block["event"], json.loads(block["data"])) for block in blocks if "data" in block]
+    with service.client() as client, client.sse(f"/v1/jobs/{job_id}/events") as stream:
+        events = [(sent.event, json.loads(sent.data)) for sent in stream if sent.data]
     assert [data["name"] for kind, data in events if kind == "artifact"].count("stylized.ply") == 1
     assert [data["status"] for kind, data in events if kind == "status"].count("succeeded") == 1
     assert len(list((service.data / "artifacts" / job_id).rglob("stylized.ply"))) == 1
@@ -126,7 +112,7 @@ def test_job_survives_kills_of_all_its_processes(service: Service, files: dict[s
     # the result is stored, and the row that makes it visible is being written or has just been written
     wait_for(lambda: any(folder.rglob("stylized.ply")), "the result's file", service.said, every=0.002)
     service.kill(DISPATCHER)
-    job = ended(service, job_id)
+    job = service.succeeded(job_id)
     outcomes = [attempt["outcome"] for attempt in job["attempts"]]
     assert outcomes[:3] == ["lost", "failed", "lost"]
     assert job["attempts"][1]["error"]["code"] == "crashed"
@@ -162,7 +148,7 @@ def test_job_survives_kills_of_its_ranks(service: Service, files: dict[str, Path
     for process in service.processes("ray::RankProcess"):
         with contextlib.suppress(psutil.NoSuchProcess):  # one that the plan leaves out ends by itself
             process.kill()
-    job = ended(service, job_id)
+    job = service.succeeded(job_id)
     assert job["result"]["steps"] == STEPS
     log = httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/log.txt", timeout=60).text
     assert "Resuming from step" in log

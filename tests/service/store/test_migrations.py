@@ -14,7 +14,7 @@ from service.store.database import MIGRATIONS, SCHEMA, Database
 from sgsst_core.errors import SettingsError
 from tests.api.service import ROOT, Service, wait_for
 from tests.api.service import submit as submit_job
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import input_files
 
 VERSIONS = sorted(path.name[:4] for path in (MIGRATIONS / "versions").glob("[0-9]*.py"))
 
@@ -55,7 +55,7 @@ def next_version(folder: Path) -> Path:
 @pytest.mark.slow
 def test_this_version_runs_on_tables_of_the_next_one(tmp_path: Path, tiny_installed: Path) -> None:
     code = next_version(tmp_path / "next")
-    files = dict(zip(("scene", "cameras", "style"), write_files(tmp_path, wall()), strict=True))
+    files = input_files(tmp_path)
 
     def submit(client: Any) -> str:
         return submit_job(client, files, steps_sos=300, steps_coarse=0, backbone="vgg16")
