@@ -206,6 +206,17 @@ class Service:
         self.stop()
 
 
+class Unready(Service):
+    """Service whose `start` waits until it responds, even if it is not ready."""
+
+    def ready(self) -> bool:
+        """Return whether the service responds."""
+        try:
+            return httpx2.get(f"{self.url}/livez", timeout=5).status_code == 200
+        except httpx2.TransportError:
+            return False
+
+
 def undisturbed(files: Mapping[str, Path], parameters: Mapping[str, Any], folder: Path) -> Path:
     """Stylize the files with `sgsst stylize` on one rank, and return the path of the resulting PLY."""
     out = folder / "stylized.ply"

@@ -9,20 +9,9 @@ import httpx2
 import pytest
 
 from tests.api.http.sending import refused
-from tests.api.service import Service, wait_for
+from tests.api.service import Service, Unready, wait_for
 
 PARAMETERS = {"preset": "standard", "steps_sos": 3, "backbone": "vgg16", "early_stop": False}
-
-
-class Unready(Service):
-    """Service whose `start` waits until it responds, even if it is not ready."""
-
-    def ready(self) -> bool:
-        """Return whether the service responds."""
-        try:
-            return httpx2.get(f"{self.url}/livez", timeout=5).status_code == 200
-        except httpx2.TransportError:
-            return False
 
 
 @pytest.fixture

@@ -33,66 +33,56 @@ def hook() -> None:
     sys.addaudithook(_interrupt)
 
 
-READING = [["check"], ["bench", "quality"], ["stylize"]]
-
-
-@pytest.mark.parametrize("command", READING, ids=" ".join)
-def test_ctrl_c_while_reading_is_announced(
-    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene, views, style = write_files(tmp_path, wall())
-    INTERRUPTED_AT.append(("open", str(scene)))
-    out = [] if command == ["check"] else ["--out", str(tmp_path / "out" / "out.ply")]
-    assert main([*command, str(scene), "--cameras", str(views), "--style", str(style), *out]) == 130
-    assert not INTERRUPTED_AT
-    assert capsys.readouterr().err.splitlines()[-1] == "Aborted. Output files are complete or were not written."
-
-
-@pytest.mark.parametrize("command", ["convert", "render", "study", "plan"])
-def test_ctrl_c_while_writing_leaves_no_file(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene, views, style = map(str, write_files(tmp_path, wall()))
-    out = tmp_path / "out"
-    arguments = {
-        "convert": ["convert", scene, str(out / "scene.spz")],
-        "render": ["render", scene, "--cameras", views, "--out", str(out)],
-        "plan": ["plan", scene, "--cameras", views, "--style", style, "--out", str(out / "plan.json")],
-        "study": ["study", "make", f"a={scene}", f"b={scene}", "--style", style, "--cameras", views],
+def arguments(command: str, folder: Path, out: Path) -> list[str]:
+    """Return a command with small inputs in a folder, which writes to another folder."""
+    scene, views, style = map(str, write_files(folder, wall()))
+    seen, styled = ["--cameras", views], ["--cameras", views, "--style", style]
+    short = ["--fps", "2", "--seconds", "1"]
+    return {
+        "check": ["check", scene, *styled],
+        "bench": ["bench", "quality", scene, *styled, "--out", str(out)],
+        "stylize": ["stylize", scene, *styled, "--out", str(out / "out.ply")],
+        "convert": ["convert", scene, str(out / "scene.ply")],
+        "usd": ["convert", scene, str(out / "scene.usdc")],
+        "blend": ["blend", scene, scene, "--out", str(out / "scene.ply")],
+        "render": ["render", scene, *seen, "--out", str(out)],
+        "video": ["render", scene, *seen, "--video", str(out / "video.mp4"), *short],
+        "frames": ["render", scene, *seen, "--video", str(out), *short],
+        "plan": ["plan", scene, *styled, "--out", str(out / "plan.json")],
+        "study": ["study", "make", f"a={scene}", f"b={scene}", *styled, "--out", str(out / "a.html")],
     }[command]
-    if command == "study":
-        arguments += ["--out", str(out / "study.html")]
-    INTERRUPTED_AT.append(("os.rename", str(out)))  # the temporary file is complete, and not yet at its place
-    assert main(arguments) == 130
+
+
+@pytest.mark.parametrize(
+    ("event", "command"),
+    [
+        *(("open", command) for command in ("check", "bench", "stylize")),
+        # the temporary file is complete, and not yet at its place
+        *(("os.rename", command) for command in ("convert", "render", "study", "plan")),
+    ],
+)
+def test_ctrl_c_is_announced_and_leaves_no_file(event: str, command: str, tmp_path: Path, sgsst: Sgsst) -> None:
+    out = tmp_path / "out"
+    words = arguments(command, tmp_path, out)
+    INTERRUPTED_AT.append((event, str(tmp_path / "scene.ply") if event == "open" else str(out)))
+    said = sgsst(words, 130)
     assert not INTERRUPTED_AT
-    assert capsys.readouterr().err.splitlines()[-1] == "Aborted. Output files are complete or were not written."
-    assert not out.exists()
+    assert said.splitlines()[-1] == "Aborted. Output files are complete or were not written."
+    assert event == "open" or not out.exists()
 
 
 @pytest.mark.parametrize(
     "command",
     ["convert", "blend", "render", "video", "frames", "study", "plan", pytest.param("usd", marks=pytest.mark.slow)],
 )
-def test_full_disk_is_one_message_and_leaves_no_file(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene, views, style = map(str, write_files(tmp_path, wall()))
+def test_full_disk_is_one_message_and_leaves_no_file(command: str, tmp_path: Path, sgsst: Sgsst) -> None:
     out = tmp_path / "new" / "out"
-    seen = ["--cameras", views]
-    arguments = {
-        "convert": ["convert", scene, str(out / "scene.ply")],
-        "usd": ["convert", scene, str(out / "scene.usdc")],
-        "blend": ["blend", scene, scene, "--out", str(out / "scene.ply")],
-        "render": ["render", scene, *seen, "--out", str(out)],
-        "video": ["render", scene, *seen, "--video", str(out / "video.mp4"), "--fps", "2", "--seconds", "1"],
-        "frames": ["render", scene, *seen, "--video", str(out), "--fps", "2", "--seconds", "1"],
-        "plan": ["plan", scene, *seen, "--style", style, "--out", str(out / "plan.json")],
-        "study": ["study", "make", f"a={scene}", f"b={scene}", "--style", style, *seen, "--out", str(out / "a.html")],
-    }[command]
+    words = arguments(command, tmp_path, out)
     with full_disk(1000):
-        assert main(arguments) == 2
-    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1
-    assert errors[0].startswith(f"error: {out}")
-    assert "cannot be written: File too large. Free some space" in errors[0]
+        said = sgsst(words, 2)
+    (error,) = (line for line in said.splitlines() if line.startswith("error: "))
+    assert error.startswith(f"error: {out}")
+    assert "cannot be written: File too large. Free some space" in error
     assert not out.parent.exists()
 
 

@@ -47,7 +47,7 @@ from tests.api.http.sending import (
     refused,
     send,
 )
-from tests.api.service import Service, wait_for
+from tests.api.service import Service, Unready, wait_for
 from tests.pngs import chunk, png
 from tests.service.store.helpers import lease
 from tests.small_scenes import ball, write_files
@@ -481,26 +481,15 @@ def test_partial_files_of_dead_process_are_removed(tmp_path: Path, monkeypatch: 
     store.close()
 
 
-def _answers(url: str) -> bool:
-    try:
-        return httpx2.get(f"{url}/livez", timeout=5).status_code == 200
-    except httpx2.TransportError:
-        return False
-
-
 @pytest.mark.slow
 def test_full_disk_rejects_requests(tmp_path: Path, files: dict[str, bytes]) -> None:
-    with Service(tmp_path / "data", alone=True) as service:
-        service.stop()
-        service.environment["SGSST_MIN_FREE_BYTES"] = str(10**18)
-        service.ready = lambda: _answers(service.url)  # type: ignore[method-assign]
-        service.start()
-        with service.client() as client:
-            refused(client.post("/v1/jobs", files=form(files)), 507, "insufficient-storage")
-            refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": "5"}), 507, "insufficient-storage")
-            health = client.get("/readyz")
-            assert (health.status_code, health.json()["checks"]["disk"]) == (503, "NoSpaceError")
-            assert health.json()["checks"]["dispatchers"] == "none"
+    full = Unready(tmp_path / "data", alone=True, SGSST_MIN_FREE_BYTES=str(10**18))
+    with full, full.client() as client:
+        refused(client.post("/v1/jobs", files=form(files)), 507, "insufficient-storage")
+        refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": "5"}), 507, "insufficient-storage")
+        health = client.get("/readyz")
+        assert (health.status_code, health.json()["checks"]["disk"]) == (503, "NoSpaceError")
+        assert health.json()["checks"]["dispatchers"] == "none"
 
 
 def test_job_is_named_by_its_files_and_renamed(client: httpx2.Client, files: dict[str, bytes]) -> None:

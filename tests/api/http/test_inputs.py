@@ -4,20 +4,27 @@ import hashlib
 import re
 from email.message import Message
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import unquote
 
 import httpx2
 import pytest
+from sqlalchemy import event
 
+from api.http.context import Caller
 from api.http.schemas import MOST_POINTS
 from api.http.sending import disposition
+from api.http.submission import _referred_input
 from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
+from service.store.jobs import NewJob
 from sgsst_core.progress import Progress
 from tests.api.http.sending import refused
 from tests.api.service import Service
+from tests.service.store.helpers import SHA
+from tests.stores import new_store
 
 #: Names of uploaded files.
 HOSTILE = [
@@ -212,6 +219,21 @@ def test_previews_and_loss_history(client: httpx2.Client, paths: dict[str, Path]
 
 
 # --- references ----------------------------------------------------------------------------------------------------
+
+
+def test_reference_reads_no_other_entry(tmp_path: Path) -> None:
+    """A request may refer to hundreds of jobs, each with thousands of photos."""
+    store = new_store(ServiceSettings(data=tmp_path))
+    store.inputs.add_blob(SHA, "aa/blob", 3)
+    entries = [{"role": "style", "name": f"{number}.png", "sha256": SHA, "size": 3} for number in range(3)]
+    job, _ = store.jobs.create(NewJob("local", "", 0, {}, entries), limit=10)
+    read: list[str] = []
+    event.listen(store.database.engine, "before_cursor_execute", lambda *each: read.append(each[2]))
+    context: Any = SimpleNamespace(store=store)
+    assert _referred_input(context, Caller("local", 0), job.id, "style:1", "style", {}) == entries[1]
+    assert not [statement for statement in read if statement.startswith("SELECT jobs.inputs")]
+    assert len([statement for statement in read if "json_each" in statement and "LIMIT 1" in statement]) == 1
+    store.close()
 
 
 def test_new_job_uses_inputs_of_an_earlier_one(

@@ -17,7 +17,7 @@ from service.store.jobs import MOST_SHARES
 from service.store.tables import ShareRow
 from tests.api.conftest import KEYED, Services
 from tests.api.http.sending import refused
-from tests.api.http.test_hanging import MANY
+from tests.api.http.test_outages import MANY
 from tests.api.service import Service, check_documented, submit, wait_for
 
 PLY, COLORS, THUMBNAIL = b"ply\nstylized", b"\0\1" * 9, b"\xff\xd8\xff\xe0"

@@ -24,7 +24,7 @@ from service.inspection.process import MAX_REPORTS
 from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import open_store
-from tests.api.service import PATIENCE
+from tests.api.service import PATIENCE, ROOT, Service
 from tests.service.inspection import attack
 from tests.service.inspection.test_inspector import Inspect, inspecting
 from tests.small_scenes import input_files
@@ -281,3 +281,37 @@ def test_filter_of_each_architecture(machine: str, architecture: int, numbers: d
     assert verdict(program, architecture, 435) == verdict(program, architecture, 463) == absent
     assert verdict(program, architecture, 0x40000000 + numbers["socket"]) == absent
     assert verdict(program, 0x40000003, numbers["read"]) == refuse
+
+
+@pytest.mark.slow
+def test_compromised_reader_does_not_affect_service(tmp_path: Path) -> None:
+    paths = input_files(tmp_path)
+    (tmp_path / "there").write_text("there")
+    service = Service(tmp_path / "data", alone=True, AWS_SECRET_ACCESS_KEY="for nobody")
+    service._command = [sys.executable, str(ROOT / "tests/service/inspection/compromised_api.py")]
+    with service, service.client() as client, socket.create_server(("127.0.0.1", 0)) as listener:
+        assert service._process is not None
+        files = {role: (path.name, path.read_bytes()) for role, path in paths.items()}
+        assert client.post("/v1/jobs", files=files).status_code == 202
+        blob = max((service.data / "blobs").rglob("*"), key=lambda path: path.is_file() and path.stat().st_size)
+        before = blob.read_bytes()
+        target: dict[str, object] = {
+            "data": str(service.data),
+            "blob": str(blob),
+            "outside": str(tmp_path),
+            "own": "scene/scene.ply",
+        }
+        target |= {"port": listener.getsockname()[1], "api": service._process.pid}
+        attacking = f"# attack\n{source.getsource(attack)}\nreached = attack({target!r})\n".encode()
+        code = ("scene.ply", files["scene"][1] + attacking)
+        answer = client.post("/v1/jobs", files={**files, "scene": code})
+        assert (answer.status_code, answer.json()["code"]) == (422, "invalid-scene")
+        detail = answer.json()["detail"]
+        assert detail.startswith("{"), detail
+        content = json.loads(detail)
+        outcomes = {**content["files"], **content["calls"]}
+        assert {name for name, outcome in outcomes.items() if outcome == "done"} == {"read own scene"}, outcomes
+        assert "for nobody" not in str(content["environment"])
+        assert client.post("/v1/jobs", files={**files, "style": ("t.png", files["style"][1])}).status_code == 202
+        assert service._process.poll() is None
+        assert blob.read_bytes() == before

@@ -55,6 +55,24 @@ def test_slow_clients_are_disconnected_without_blocking_others(
             assert b'"code":"too-slow"' in answer
 
 
+def drip(connection: socket.socket, more: bytes) -> bytes:
+    """Send bytes at intervals until the service closes the connection; return its answer."""
+    connection.settimeout(0.3)
+    deadline, answered = time.monotonic() + 60, b""
+    while True:
+        assert time.monotonic() < deadline, "it is still listened to"
+        try:
+            connection.sendall(more)
+            piece = connection.recv(65536)
+            answered += piece
+            if not piece:
+                return answered
+        except TimeoutError:
+            continue
+        except OSError:
+            return answered
+
+
 def test_dripping_clients_are_disconnected(service: Service) -> None:
     """A client that sends single bytes at intervals does not stall, but is far below the minimum rate."""
     head = lines(
@@ -64,18 +82,7 @@ def test_dripping_clients_are_disconnected(service: Service) -> None:
     for start in rest.values():
         with connect(service) as connection:
             connection.sendall(start)
-            connection.settimeout(0.3)
-            deadline = time.monotonic() + 60
-            ended = False
-            while not ended:
-                assert time.monotonic() < deadline, "it is still listened to"
-                try:
-                    connection.sendall(b"x")
-                    ended = bool(connection.recv(1000)) or True
-                except TimeoutError:
-                    continue
-                except OSError:
-                    ended = True
+            drip(connection, b"x")
 
 
 def test_endless_head_is_disconnected(service: Service) -> None:
@@ -214,20 +221,7 @@ def test_unread_body_must_end(service: Service) -> None:
     for rest in (b"", b"x"):
         with connect(service) as connection:
             connection.sendall(lines("POST /livez HTTP/1.1\nContent-Length: 1000000"))
-            connection.settimeout(0.3)
-            deadline, answered = time.monotonic() + 60, b""
-            while True:
-                assert time.monotonic() < deadline, "it is still listened to"
-                try:
-                    connection.sendall(rest)
-                    piece = connection.recv(65536)
-                    answered += piece
-                    if not piece:
-                        break
-                except TimeoutError:
-                    continue
-                except OSError:
-                    break
+            answered = drip(connection, rest)
             assert answered.startswith(b"HTTP/1.1 405 ")
             assert answered.count(b"HTTP/1.1") == 1, "it is answered twice"
 
