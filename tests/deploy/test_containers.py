@@ -1,4 +1,4 @@
-"""Tests of `deploy/Dockerfile` and `deploy/compose.yaml`: services are built, started, used, killed and stopped."""
+"""Tests of `deploy/Dockerfile`, `deploy/compose.yaml` and scripts: linters, and services that start and survive."""
 
 import json
 import os
@@ -15,7 +15,7 @@ import httpx2
 import pytest
 
 from tests.api.service import wait_for
-from tests.deploy.containers import COMPOSE, Containers, compose_program, containers
+from tests.deploy.containers import COMPOSE, ROOT, STAND_INS, Containers, compose_program, containers
 from tests.ports import free_port
 from tests.small_scenes import wall, write_files
 
@@ -224,3 +224,23 @@ def test_job_survives_restarts_of_its_containers(
     with composed.client() as client:
         result = client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").content
     assert result == expected(files, 300, tiny_cache, tmp_path / "expected.ply")
+
+
+def lint(tool: str, *words: str | Path) -> None:
+    """Run a linter that is installed in this Python environment, and fail if it reports anything."""
+    program = Path(sys.executable).parent / tool
+    if not program.exists():
+        pytest.skip(f"{tool} is missing: see the extra [dev]")
+    ended = subprocess.run([program, *words], cwd=ROOT, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+
+
+def test_dockerfiles() -> None:
+    lint("hadolint", "deploy/Dockerfile")
+    lint("hadolint", "--ignore=DL3008", "--ignore=DL3066", STAND_INS / "Dockerfile")
+
+
+def test_scripts() -> None:
+    hosts = ["deploy/free_network.sh", "deploy/two_hosts.sh", "deploy/three_hosts.sh"]
+    lint("shellcheck", "--shell=sh", "--severity=warning", "deploy/remove_unused.sh", f"{STAND_INS}/postgres.sh")
+    lint("shellcheck", "--severity=error", *hosts)

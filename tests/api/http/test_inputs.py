@@ -195,7 +195,8 @@ def test_previews_and_loss_history(client: httpx2.Client, paths: dict[str, Path]
     assert held is not None
     artifacts = Artifacts(ServiceSettings(data=Path(store.database.url.database or "").parent).artifacts_url)
     names = ["previews/step_0000000.jpg", "previews/step_0000020.jpg"]
-    store.leases.publish(held, [artifacts.put(job_id, held.epoch, name, image_path) for name in names])
+    others = ["previewsx.jpg", "views.jpg"]  # which are no previews
+    store.leases.publish(held, [artifacts.put(job_id, held.epoch, name, image_path) for name in names + others])
     for step in range(1, 31):
         losses: dict[str, Any] = {"loss": 100.0 / step, "scales": [None, 100.0 / step]}
         now = Progress(stage="sos", step=step, total=600, seconds=float(step), **losses)

@@ -128,6 +128,7 @@ def test_revoking_key_ends_its_sessions(browser: httpx2.Client, store: Store) ->
     assert browser.get("/v1/jobs").status_code == 200
     store.keys.revoke(row.id)
     refused(browser.get("/v1/jobs"), 401, "unauthorized")
+    refused(browser.get("/v1/jobs", headers={"Authorization": f"Bearer {key}"}), 401, "unauthorized")
     assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False, "within": budget()}
 
 

@@ -15,7 +15,7 @@ import httpx2
 import pytest
 
 from service.files.objects import Artifacts, FileCache, ObjectStore
-from service.problems import DamagedFileError, LostFileError, NoSpaceError, StoreError
+from service.problems import DamagedFileError, NoSpaceError, StoreError
 from tests.api.service import Service, submit, undisturbed
 from tests.service.files.s3 import environment_of, s3_server
 from tests.small_scenes import input_files
@@ -153,14 +153,6 @@ def test_damaged_cache_entry_is_fetched_again(cache: FileCache, tmp_path: Path) 
     (tmp_path / "a").write_bytes(data[:-1] + b"x")
     cache.link(sha256, len(data), tmp_path / "b", source)
     assert ((tmp_path / "b").read_bytes(), source.fetched) == (data, 2)
-
-
-def test_lost_object_raises_lost_file_error(cache: FileCache, tmp_path: Path) -> None:
-    def fetch(target: Path) -> None:
-        raise FileNotFoundError(target)
-
-    with pytest.raises(LostFileError):
-        cache.link(content(1)[1], 1000, tmp_path / "a", fetch)
 
 
 @pytest.mark.parametrize("helps", [True, False])

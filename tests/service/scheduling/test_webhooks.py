@@ -105,13 +105,15 @@ def _deliver(store: Store, folder: Path, **values: Any) -> None:
     Deliverer(_settings(folder, **values), store).deliver_due()
 
 
-def _end_job(store: Store, url: str, owner: str = "local") -> str:
-    """Create and end a job with the webhook `url`, bypassing the validation at submission."""
+def _new_job(store: Store, url: str, owner: str = "local", events: list[WebhookEvent] | None = None) -> str:
+    """Create a job with the webhook `url`, bypassing the validation at submission."""
     store.inputs.add_blob("a" * 64, "aa/b", 1)
     inputs = [{"role": "scene", "name": "s", "sha256": "a" * 64, "size": 1}]
-    job, _ = store.jobs.create(NewJob(owner, "wall", 0, {}, inputs, url), limit=1000)
-    store.jobs.cancel(job.id, owner)
-    return job.id
+    return store.jobs.create(NewJob(owner, "wall", 0, {}, inputs, url, events), limit=1000)[0].id
+
+
+def _end_job(store: Store, url: str, owner: str = "local") -> str:
+    return store.jobs.cancel(_new_job(store, url, owner), owner).id
 
 
 def _tries(store: Store) -> list[int]:
@@ -158,11 +160,9 @@ def test_chosen_events_are_sent_and_progress_does_not_queue_up(
     def sent() -> list[str]:
         return [json.loads(body)["type"] for _, body in receiver.received]
 
-    store.inputs.add_blob("a" * 64, "aa/b", 1)
-    inputs = [{"role": "scene", "name": "s", "sha256": "a" * 64, "size": 1}]
     choices: tuple[list[WebhookEvent] | None, ...] = (["started", "progress", "completed"], ["started"], None)
     for events in choices:
-        store.jobs.create(NewJob("local", "wall", 0, {}, inputs, receiver.url, events), limit=1000)
+        _new_job(store, receiver.url, events=events)
         lease = helpers.lease(store)
         store.leases.start(lease)
         for step in (1, 2, 3):

@@ -359,18 +359,6 @@ def test_long_loss_history_is_thinned(store: Store, monkeypatch: pytest.MonkeyPa
     assert (points[-1]["attempt"], points[-1]["step"]) == (12, 20)
 
 
-def test_newest_preview_of_each_job(store: Store) -> None:
-    jobs = sorted(queue(store) for _ in range(3))  # created at the same moment, so their ids define the order
-    for number in range(2):
-        held = lease(store)
-        names = ["previews/step_0000009.jpg", "previews/step_0000100.jpg", "views.jpg", "previewsx.jpg"]
-        store.leases.publish(held, [Published(name, f"{number}/{name}", 1, SHA) for name in names[number:]])
-    newest = "previews/step_0000100.jpg"
-    assert [job.preview for job in store.jobs.page(None)] == [None, newest, newest]
-    assert store.jobs.detail(jobs[0], None)[0].preview == newest
-    assert store.jobs.detail(jobs[2], None)[0].preview is None
-
-
 def test_inputs_are_read_in_pieces(store: Store) -> None:
     """Lists have the scene, styles and cameras, and count photos and masks, whose names are read by page."""
     roles = ["photos", "scene", "photos", "style", "mask", "style", "cameras", "photos"]
@@ -427,18 +415,6 @@ def test_job_is_kept_as_long_as_requested_at_most_as_the_service_keeps_it(
         assert store.retention.expire() == [job_id]
         shown = store.jobs.page("local")
         assert [job.row.status for job in shown] == ([status] if status else [])
-
-
-def test_revoked_key_is_rejected(store: Store) -> None:
-    row, text = store.keys.create("me")
-    assert store.keys.find(text) is not None
-    assert store.keys.find(text + "x") is None
-    with store.database.reading() as session:
-        stored = session.connection().exec_driver_sql("SELECT sha256 FROM api_keys").scalar()
-    assert stored is not None
-    assert text not in stored
-    store.keys.revoke(row.id)
-    assert store.keys.find(text) is None
 
 
 # --- comparison with a model --------------------------------------------------------------------------------------
