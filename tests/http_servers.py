@@ -29,23 +29,48 @@ def send(handler: BaseHTTPRequestHandler, body: bytes = b"", status: int = 200, 
     handler.wfile.write(body)
 
 
+def repeating(head: bytes, block: bytes, cut_off: threading.Event, pause: float = 0.0, most: int = 64 << 20) -> Answer:
+    """Return an answer that sends a head, and then the same bytes until the client closes the connection.
+
+    Args:
+        cut_off: Event to set then.
+        pause: Seconds between blocks.
+        most: Number of bytes after which the answer ends.
+    """
+
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        handler.wfile.write(head)
+        try:
+            for _ in range(most // len(block)):
+                if cut_off.wait(pause):
+                    return
+                handler.wfile.write(block)
+        except OSError:
+            cut_off.set()
+
+    return answer
+
+
 class LocalServer(ThreadingHTTPServer):
     """Server on a free port of this machine that answers requests within a `with` block.
 
     Args:
-        answer: Function that answers a request, whether GET or POST.
+        answer: Function that answers a request of any method.
+        version: Version of HTTP; connections stay open from 1.1 on.
     """
 
     daemon_threads = True
     block_on_close = False
     request_queue_size = 100
 
-    def __init__(self, answer: Answer) -> None:
+    def __init__(self, answer: Answer, version: str = "HTTP/1.0") -> None:
         class Handler(BaseHTTPRequestHandler):
+            protocol_version = version
+
             def do_GET(self) -> None:
                 answer(self)
 
-            do_POST = do_GET  # noqa: N815 (http.server's name)
+            do_POST = do_PUT = do_DELETE = do_HEAD = do_GET  # noqa: N815 (http.server's names)
 
             def log_message(self, *ignored: object) -> None:
                 return

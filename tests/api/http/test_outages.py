@@ -270,12 +270,10 @@ Hanging = tuple[dict[str, str], Callable[[], None], Callable[[], None]]
 @contextmanager
 def hanging_store(folder: Path) -> Iterator[Hanging]:
     """Provide settings with a store that can hang, and functions that make it hang and answer again."""
-    with s3_server() as url:
-        s3 = FaultyS3(url)
+    with s3_server() as url, FaultyS3(url) as s3:
         assert httpx2.put(f"{url}/results").status_code == 200
-        settings = {"SGSST_ARTIFACTS": "s3://results/files", **environment_of(s3.url)}
+        settings = {"SGSST_ARTIFACTS": "s3://results/files", **environment_of(s3.origin)}
         yield settings, lambda: s3.fail("silence", 10**6), s3.heal
-        s3.close()
 
 
 @contextmanager

@@ -21,10 +21,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from plyfile import PlyData
 
-from sgsst_core.constants import SH_C0
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import by_name
-from sgsst_core.files.formats.splat import ROW
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit import orbit
 from sgsst_core.rasterizer import make_rasterizer
@@ -126,7 +124,7 @@ def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path
     ply, _, _ = write_files(tmp_path, scene, views)
     ply.unlink()  # the browser and `sgsst render` read only the compressed scene, whose name is no hint
     if form == "splat":
-        ply.write_bytes(splat_bytes(scene))
+        ply.write_bytes(scene_path(shared_data, name).read_bytes())
     elif form.startswith("ksplat"):
         ply.write_bytes(ksplat(scene, int(form[-1])))
     else:
@@ -284,18 +282,6 @@ def assert_shown_like(watched: Watched, folder: Path, scene: Path, *, differs: b
     image = make_rasterizer("cpu", classic).render(scene_colors(classic, camera), camera)
     expected = np.rint(image.clamp(0, 1).double().numpy() * 255)
     assert (psnr(pixels, expected) < 35) == differs
-
-
-def splat_bytes(scene: Scene) -> bytes:
-    """Encode a scene in the .splat format, for which the project has no writer."""
-    rows = np.zeros(len(scene), ROW)
-    rows.flags.writeable = True
-    quats = scene.quats / scene.quats.norm(dim=1, keepdim=True)
-    shown = torch.cat([scene.sh_dc * SH_C0 + 0.5, scene.opacities.sigmoid()[:, None]], dim=1)
-    rows["position"], rows["scale"] = scene.means.numpy(), scene.scales.exp().numpy()
-    rows["color"] = (shown * 255).round().clamp(0, 255).numpy()
-    rows["rotation"] = (quats * 128 + 128).round().clamp(0, 255).numpy()
-    return rows.tobytes()
 
 
 @pytest.mark.parametrize("stated", [False, True])

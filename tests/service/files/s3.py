@@ -5,13 +5,13 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any, Literal
+from http.server import BaseHTTPRequestHandler
+from typing import Literal
 
 import httpx2
 import pytest
 
-from tests.http_servers import serve
+from tests.http_servers import LocalServer
 
 #: "slow-down": 503, S3's response to too many requests. "not-implemented": 501. "reset": the connection is closed
 #: before the response. "cut-off": it is closed in the middle of the response. "silence": there is no response until
@@ -47,11 +47,10 @@ def environment_of(endpoint: str) -> dict[str, str]:
     }
 
 
-class FaultyS3:
+class FaultyS3(LocalServer):
     """Proxy that forwards requests to an S3 server, except for those that should fail.
 
     Attributes:
-        url: URL of the proxy.
         asked: Method and path of every request.
     """
 
@@ -60,25 +59,8 @@ class FaultyS3:
         self._faults: list[tuple[Fault, Callable[[str, str], bool]]] = []
         self._lock = threading.Lock()
         self._healed = threading.Event()
-        faulty = self
-        client = httpx2.Client(base_url=behind, timeout=60)
-
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-
-            def _answer(self) -> None:
-                body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-                faulty._answer(self, client, body)
-
-            do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = _answer  # noqa: N815 (http.server's names)
-
-            def log_message(self, *arguments: Any) -> None:
-                return
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._server.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self._server.server_address[1]}"
-        serve(self._server)
+        self._client = httpx2.Client(base_url=behind, timeout=60)
+        super().__init__(self._answer, "HTTP/1.1")
 
     def fail(self, fault: Fault, times: int, which: Callable[[str, str], bool] = lambda method, path: True) -> None:
         """Inject a fault into the next `times` requests for which `which(method, path)` is true."""
@@ -92,11 +74,9 @@ class FaultyS3:
             self._faults = []
             self._healed.set()
 
-    def close(self) -> None:
-        """Close the proxy."""
+    def __exit__(self, *ignored: object) -> None:
         self.heal()
-        self._server.shutdown()
-        self._server.server_close()
+        super().__exit__(*ignored)
 
     def _fault(self, method: str, path: str) -> Fault | None:
         with self._lock:
@@ -105,7 +85,8 @@ class FaultyS3:
                 return self._faults.pop(0)[0]
         return None
 
-    def _answer(self, handler: BaseHTTPRequestHandler, client: httpx2.Client, body: bytes) -> None:
+    def _answer(self, handler: BaseHTTPRequestHandler) -> None:
+        body = handler.rfile.read(int(handler.headers.get("Content-Length", 0)))
         fault = self._fault(handler.command, handler.path)
         if fault == "slow-down":
             self._send(handler, 503, {"Content-Type": "application/xml"}, _SLOW_DOWN)
@@ -118,8 +99,8 @@ class FaultyS3:
             handler.close_connection = True
         else:
             headers = {name: value for name, value in handler.headers.items() if name.lower() != "connection"}
-            request = client.build_request(handler.command, handler.path, headers=headers, content=body)
-            answer = client.send(request)
+            request = self._client.build_request(handler.command, handler.path, headers=headers, content=body)
+            answer = self._client.send(request)
             self._send(handler, answer.status_code, dict(answer.headers), answer.content, cut=fault == "cut-off")
 
     def _send(

@@ -6,7 +6,7 @@ import os
 import signal
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,17 +26,11 @@ from service.store.tables import BlobRow, UploadRow
 from tests.api.http.sending import TUS, begin, refused, send
 from tests.api.service import Service
 from tests.raised import raises_problem
-from tests.service.files.s3 import Fault, FaultyS3, environment_of, s3_server
+from tests.service.files.s3 import Fault, FaultyS3, environment_of
 from tests.stores import new_store
 
 MB = 1 << 20
 HOUR = 3600.0
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    with s3_server() as url:
-        yield url
 
 
 @contextmanager
@@ -91,17 +85,14 @@ class Fleet:
 
 
 @pytest.fixture
-def fleet(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
-    s3 = FaultyS3(server)
-    for name, value in environment_of(s3.url).items():
-        monkeypatch.setenv(name, value)
+def fleet(s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
     url = f"s3://inputs/{os.urandom(4).hex()}"
-    assert httpx2.put(f"{server}/inputs").status_code == 200
-    store = new_store(ServiceSettings(data=tmp_path / "database"))
-    yield Fleet(tmp_path, store, url, s3, Artifacts(url).objects)
-    s3.heal()
-    store.close()
-    s3.close()
+    assert httpx2.put(f"{s3_url}/inputs").status_code == 200
+    with FaultyS3(s3_url) as s3, closing(new_store(ServiceSettings(data=tmp_path / "database"))) as store:
+        for name, value in environment_of(s3.origin).items():
+            monkeypatch.setenv(name, value)
+        yield Fleet(tmp_path, store, url, s3, Artifacts(url).objects)
+        s3.heal()
 
 
 def test_blob_of_one_host_is_read_on_another(fleet: Fleet) -> None:

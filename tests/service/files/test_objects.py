@@ -17,7 +17,7 @@ import pytest
 from service.files.objects import Artifacts, FileCache, ObjectStore
 from service.problems import DamagedFileError, NoSpaceError, StoreError
 from tests.api.service import Service, submit, undisturbed
-from tests.service.files.s3 import environment_of, s3_server
+from tests.service.files.s3 import environment_of
 from tests.small_scenes import input_files
 
 
@@ -230,19 +230,13 @@ SIZE = 6 * (1 << 20) + 17
 
 
 @pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
-    with s3_server() as url:
-        yield url
-
-
-@pytest.fixture(scope="module")
-def environment(endpoint: str) -> Iterator[dict[str, str]]:
+def environment(s3_url: str) -> Iterator[dict[str, str]]:
     """Create a bucket named `results`, and set and yield the environment variables of S3 clients."""
-    values = environment_of(endpoint)
+    values = environment_of(s3_url)
     with pytest.MonkeyPatch.context() as patch:
         for name, value in values.items():
             patch.setenv(name, value)
-        assert httpx2.put(f"{endpoint}/results").status_code == 200
+        assert httpx2.put(f"{s3_url}/results").status_code == 200
         yield values
 
 

@@ -27,29 +27,21 @@ from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import file_digest
 from tests.api.service import wait_for
-from tests.service.files.s3 import FaultyS3, environment_of, s3_server
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    with s3_server() as url:
-        assert httpx2.put(f"{url}/files").status_code == 200
-        yield url
+from tests.service.files.s3 import FaultyS3, environment_of
 
 
 @pytest.fixture
-def s3(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyS3]:
-    faulty = FaultyS3(server)
-    for name, value in environment_of(faulty.url).items():
-        monkeypatch.setenv(name, value)
+def s3(s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyS3]:
+    assert httpx2.put(f"{s3_url}/files").status_code == 200
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "node"))
     monkeypatch.setenv("SGSST_CACHE", os.environ.get("SGSST_CACHE", ""))
     monkeypatch.setattr(rank_folder, "_SCAN_SECONDS", 0.05)
     monkeypatch.setattr(rank_folder, "_RETRY_SECONDS", 0.1)
     monkeypatch.setattr(publishing, "_RETRY_SECONDS", 0.1)
-    yield faulty
-    faulty.heal()
-    faulty.close()
+    with FaultyS3(s3_url) as faulty:
+        for name, value in environment_of(faulty.origin).items():
+            monkeypatch.setenv(name, value)
+        yield faulty
 
 
 @dataclass

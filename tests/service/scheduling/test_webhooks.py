@@ -32,15 +32,13 @@ from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.tables import DeliveryRow
 from sgsst_core.progress import Progress
-from tests.http_servers import Answer, LocalServer, send
+from tests.http_servers import Answer, LocalServer, repeating, send
 from tests.service.store import helpers
 from tests.service.store.helpers import Clock
 from tests.stores import migrated_database, new_store
 
 #: Time limit of a test's waits in seconds.
 PATIENCE = 60.0
-#: Size in bytes of a response body that the sender must not read: larger than the buffers of a connection.
-LARGE = 64 << 20
 
 
 class Receiver(LocalServer):
@@ -240,19 +238,10 @@ def test_only_the_head_of_a_response_is_read(
     tmp_path: Path, store: Store, start: Start, head: bytes, tries: list[int]
 ) -> None:
     """Only the head of a response is read, and at most some of an endless one."""
-    sent, cut_off = [0], threading.Event()
-
-    def endless(handler: Any) -> None:
-        handler.wfile.write(head)
-        try:
-            while sent[0] < LARGE:
-                sent[0] += handler.wfile.write(b"x" * (1 << 16))
-        except OSError:
-            cut_off.set()
-
+    endless = repeating(head, b"x" * (1 << 16), cut_off := threading.Event())
     _end_job(store, start(endless).url)
     _deliver(store, tmp_path)
-    assert cut_off.wait(PATIENCE), f"{sent[0]:,} bytes were read"
+    assert cut_off.wait(PATIENCE), "everything was read"
     assert _tries(store) == tries
 
 
@@ -261,18 +250,9 @@ def test_slow_receiver_is_cut_off_at_the_deadline(
     head: bytes, tmp_path: Path, store: Store, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No single read takes long, but the deadline covers the whole delivery."""
-    cut_off = threading.Event()
     monkeypatch.setattr(webhooks, "_DEADLINE", 2.0)  # long enough to send the message on a busy machine
-
-    def drip(handler: Any) -> None:
-        handler.wfile.write(head)
-        try:
-            while not cut_off.wait(0.02):
-                handler.wfile.write(b"x" if head else b"HTTP/1.1 100 Continue\r\n\r\n")
-        except OSError:
-            cut_off.set()
-
-    receiver = start(drip)
+    block = b"x" if head else b"HTTP/1.1 100 Continue\r\n\r\n"
+    receiver = start(repeating(head, block, cut_off := threading.Event(), 0.02))
     _end_job(store, receiver.url)
     _deliver(store, tmp_path)
     assert cut_off.wait(PATIENCE)
