@@ -1,18 +1,14 @@
 """Tests of batches on this machine: what is made, what is repeated, and what fails."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 from api.cli.main import main
+from tests.api.cli.test_cli import interrupted
 from tests.api.conftest import Sgsst
-from tests.api.service import ROOT
 from tests.small_scenes import wall, write_files
 
 pytestmark = [pytest.mark.usefixtures("one_thread", "tiny_installed"), pytest.mark.slow]
@@ -61,16 +57,7 @@ def test_only_what_is_missing_or_changed_is_made(arguments: list[str], tmp_path:
 
 def test_interrupted_result_is_resumed(arguments: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     batch = [*arguments, "--steps-sos", "150", "--learning-rate", "0.1"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "api.cli", *batch]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("schedule"):
-                break
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=600)
-    assert process.returncode == 130
+    interrupted(batch, tmp_path)
     assert not times(tmp_path / "out")
     assert (tmp_path / "out" / "scene_style.checkpoint.safetensors").exists()
     capfd.readouterr()

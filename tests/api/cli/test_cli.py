@@ -244,13 +244,12 @@ def test_failed_report_preserves_scene(files: Files, sgsst: Sgsst) -> None:
 # --- stop and resume -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_resume_after_ctrl_c_is_bit_identical(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
-    options = files.stylize("--steps-sos", "150", "--learning-rate", "0.1")  # a second: a signal arrives during it
+def interrupted(arguments: list[str], folder: Path) -> str:
+    """Run a command in a folder until its schedule, press Ctrl-C, and return its errors."""
+    command = [sys.executable, "-m", "api.cli", *arguments]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "api.cli", *options]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=files.ply.parent
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=folder
     ) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -259,6 +258,13 @@ def test_resume_after_ctrl_c_is_bit_identical(files: Files, capfd: pytest.Captur
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=600)  # includes compilation of the kernels
     assert process.returncode == 130, error
+    return error
+
+
+@pytest.mark.slow
+def test_resume_after_ctrl_c_is_bit_identical(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
+    options = files.stylize("--steps-sos", "150", "--learning-rate", "0.1")  # a second: a signal arrives during it
+    error = interrupted(options, files.ply.parent)
     assert "Traceback" not in error
     checkpoint = files.out.with_name("stylized.checkpoint.safetensors")
     plan = files.out.with_name("stylized.plan.json")

@@ -30,7 +30,7 @@ from service import problems
 from service.deadlines import FileThreads, suspended
 from service.problems import SHARE_ID, SHARE_TOKEN, StoreError
 from service.settings import ServiceSettings
-from tests.api.http.sending import TUS, form, refused
+from tests.api.http.sending import TUS, form, refused, send
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.ports import free_port
 from tests.postgres import Postgres, controlled_server, fresh_database, is_installed
@@ -154,11 +154,11 @@ def check_health(service: Service, ready: int) -> None:
     assert (answer.json()["checks"]["database"] == "ok") == (ready == 200)
 
 
-def at_once(send: Callable[[], httpx2.Response]) -> contextlib.ExitStack:
+def at_once(ask: Callable[[], httpx2.Response]) -> contextlib.ExitStack:
     """Start `MANY` concurrent requests; at the end of the block, wait for the responses and check them."""
     stack = contextlib.ExitStack()
     pool = stack.enter_context(ThreadPoolExecutor(MANY))
-    answers = [pool.submit(send) for _ in range(MANY)]
+    answers = [pool.submit(ask) for _ in range(MANY)]
 
     def check_all() -> None:
         for answer in answers:
@@ -211,16 +211,13 @@ def test_health_checks_answer_while_requests_wait(outage: Outage) -> None:
 def test_stream_resumes_when_database_returns(outage: Outage, files: dict[str, bytes]) -> None:
     with outage.client() as client, outage.client() as other:
         job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
-        with client.stream("GET", f"/v1/jobs/{job_id}/events") as stream:
-            lines = stream.iter_lines()
-            assert (
-                next(line for line in lines if line.startswith("data: ")) == 'data: {"status": "queued", "attempt": 0}'
-            )
+        with client.sse(f"/v1/jobs/{job_id}/events") as stream:
+            events = (json.loads(sent.data) for sent in stream if sent.data)
+            assert next(events) == {"status": "queued", "attempt": 0}
             with outage.kind("killed"):
                 check_away(other.get(f"/v1/jobs/{job_id}"))
             assert other.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
-            events = [json.loads(line[6:]) for line in lines if line.startswith("data: ")]
-            assert events[-1]["status"] == "canceled"
+            assert [*events][-1]["status"] == "canceled"
 
 
 @pytest.mark.slow
@@ -234,12 +231,10 @@ def test_interrupted_upload_can_be_resumed(outage: Outage, kind: str) -> None:
             away.enter_context(outage.kind(kind))
             yield b"y" * 50
 
-        sent = {**TUS, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
-        check_away(client.patch(place, content=body(), headers=sent))
+        check_away(send(client, place, 0, body()))
         away.close()
         offset = int(client.head(place, headers=TUS).headers["upload-offset"])
-        sent["Upload-Offset"] = str(offset)
-        answer = client.patch(place, content=(b"x" * 50 + b"y" * 50)[offset:], headers=sent)
+        answer = send(client, place, offset, (b"x" * 50 + b"y" * 50)[offset:])
         assert (answer.status_code, answer.headers["upload-offset"]) == (204, "100")
 
 

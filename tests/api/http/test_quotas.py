@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import stat
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,7 @@ from service import problems
 from service.problems import ServiceError
 from service.store.keys import NO_QUOTAS, Quotas
 from tests.api.conftest import Sgsst
-from tests.api.http.sending import TUS, begin, form, refused, send
+from tests.api.http.sending import TUS, begin, closed, connect, form, lines, refused, send
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.postgres import fresh_database, is_installed, server
 from tests.raised import raises_problem
@@ -131,11 +130,9 @@ def test_usage_of_own_key_and_of_all_keys(
 
 
 def test_connections_are_limited(service: Service) -> None:
-    host, port = service.url.removeprefix("http://").split(":")
-    held = [socket.create_connection((host, int(port))) for _ in range(6)]
+    held = [connect(service) for _ in range(6)]
     try:
-        held[-1].settimeout(30)
-        said = b"".join(iter(lambda: held[-1].recv(4096), b""))
+        said = closed(held[-1])
         assert said.startswith(b"HTTP/1.1 503 ")
         assert b"retry-after: 5" in said.lower()
         assert b'"too-many-connections"' in said
@@ -198,14 +195,10 @@ def test_dry_runs_and_full_queues_release_quota(tmp_path: Path, files: dict[str,
 
 def test_declared_bytes_over_quota_are_rejected_early(service: Service) -> None:
     before = on_disk(service)
-    host, port = service.url.removeprefix("http://").split(":")
     owner, text = owner_and_key(service, Quotas(stored_bytes=5 * MB))
-    head = (
-        f"POST /v1/jobs HTTP/1.1\r\nHost: {host}:{port}\r\nAuthorization: Bearer {text}\r\n"
-        f"Content-Type: multipart/form-data; boundary=x\r\nContent-Length: {6 * MB}\r\n\r\n"
-    )
-    with socket.create_connection((host, int(port)), timeout=PATIENCE) as connection:
-        connection.sendall(head.encode())
+    head = f"POST /v1/jobs HTTP/1.1\nAuthorization: Bearer {text}\nContent-Length: {6 * MB}\n"
+    with connect(service) as connection:
+        connection.sendall(lines(head + "Content-Type: multipart/form-data; boundary=x"))
         assert connection.recv(4096).startswith(b"HTTP/1.1 429 "), "no byte of the body was sent"
     assert on_disk(service) == before
     assert stored_bytes(service, owner) == 0

@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import httpx2
 import pytest
@@ -24,7 +23,7 @@ from service.settings import ServiceSettings
 from service.states import JobStatus, Published
 from service.store import Store, open_store
 from service.store.jobs import NewJob
-from tests.api.http.sending import OFFSET_STREAM, TUS, begin
+from tests.api.http.sending import OFFSET_STREAM, begin, closed, connect, lines, send
 from tests.api.service import Service, wait_for
 from tests.postgres import fresh_database, is_installed, server
 from tests.service.store import helpers
@@ -183,20 +182,11 @@ class Patch:
 
     def __init__(self, service: Service, where: str, offset: int, content: bytes, *, expect: bool = False) -> None:
         self.content, self.sent = content, 0
-        address = urlsplit(service.url)
-        self.socket = socket.create_connection((address.hostname, address.port), timeout=60)
+        self.socket = connect(service)
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        head = [
-            f"PATCH {where} HTTP/1.1",
-            f"Host: {address.netloc}",
-            "Tus-Resumable: 1.0.0",
-            f"Upload-Offset: {offset}",
-            f"Content-Type: {OFFSET_STREAM}",
-            f"Content-Length: {len(content)}",
-            "Connection: close",
-            *(["Expect: 100-continue"] if expect else []),
-        ]
-        self.socket.sendall("\r\n".join([*head, "", ""]).encode())
+        head = f"PATCH {where} HTTP/1.1\nTus-Resumable: 1.0.0\nUpload-Offset: {offset}\nContent-Type: {OFFSET_STREAM}\n"
+        head += f"Content-Length: {len(content)}\nConnection: close" + "\nExpect: 100-continue" * expect
+        self.socket.sendall(lines(head))
         if expect:
             assert b" 100 " in self.socket.recv(100), "it is this one's turn"
 
@@ -216,17 +206,9 @@ class Patch:
 
     def status(self) -> int:
         """Return the status of the response; 0 if the connection was closed without a response."""
-        answer = b""
-        try:
-            while part := self.socket.recv(4096):
-                answer += part
-        except OSError:
-            pass
+        answer = closed(self.socket)
         self.socket.close()
         return int(answer.split(b" ", 2)[1]) if answer else 0
-
-    def cut_off(self) -> None:
-        self.socket.close()
 
 
 def interleave(pair: Pair, clients: tuple[httpx2.Client, httpx2.Client], order: random.Random) -> set[int]:
@@ -245,8 +227,7 @@ def interleave(pair: Pair, clients: tuple[httpx2.Client, httpx2.Client], order: 
         shown = clients[0].get(where).json()
         if not shown["complete"]:
             rest = b"z" * (length - shown["offset"])
-            headers = {**TUS, "Upload-Offset": str(shown["offset"]), "Content-Type": OFFSET_STREAM}
-            statuses.add(clients[1].patch(where, content=rest, headers=headers).status_code)
+            statuses.add(send(clients[1], where, shown["offset"], rest).status_code)
         return shown if shown["complete"] else None
 
     shown = wait_for(finished, "the upload to be finished", every=0.01)
@@ -264,7 +245,7 @@ def write_at_once(pair: Pair, where: str, offset: int, length: int, turn: int, o
     while waiting := [writer for writer in writers if not writer.done and not (writer in cut and writer.sent)]:
         order.choice(waiting).send(order.choice([1, 13, length]))
     for writer in cut:
-        writer.cut_off()
+        writer.socket.close()
     return {writer.status() for writer in writers if writer not in cut}
 
 

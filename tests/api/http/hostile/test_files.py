@@ -27,14 +27,14 @@ from sgsst_core.files.formats.sog import STREAMED_SOG
 from tests.api.http.sending import (
     MB,
     NAMES,
-    OFFSET_STREAM,
-    TUS,
     Files,
     Make,
+    begin,
     count_jobs,
     form,
     image_bytes,
     refused,
+    send,
 )
 from tests.api.service import Service
 from tests.icc_profiles import with_float_steps
@@ -215,10 +215,8 @@ def test_compressed_scenes_are_detected_from_their_content(
     """The format is detected regardless of the file name, for files in the request and for tus uploads."""
     answer = client.post("/v1/jobs", files=form(files, scene=("my scan.ply", packed[what])))
     assert answer.status_code == 202, answer.text
-    headers = {**TUS, "Upload-Length": str(len(packed[what]))}
-    where = client.post("/v1/uploads", headers=headers).headers["location"]
-    headers = {**TUS, "Upload-Offset": "0", "Content-Type": OFFSET_STREAM}
-    assert client.patch(where, headers=headers, content=packed[what]).status_code == 204
+    where = begin(client, len(packed[what]))
+    assert send(client, where, 0, packed[what]).status_code == 204
     parts = [("scene", (None, where.rpartition("/")[2])), *form(files, scene=None)]
     answer = client.post("/v1/jobs", files=parts)
     assert answer.status_code == 202, answer.text

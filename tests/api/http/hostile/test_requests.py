@@ -5,11 +5,9 @@ import contextlib
 import gzip
 import json
 import re
-import socket
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from urllib.parse import urlsplit
 
 import httpx2
 import pytest
@@ -319,11 +317,9 @@ def test_lists_of_many_photos_take_little_memory(client: httpx2.Client, service:
         assert jobs[0]["input_counts"] == {"photos": 2000, "scene": 1}
         assert [each["role"] for each in jobs[0]["inputs"]] == ["scene"]
         assert len(answer.content) < MB
-    address = urlsplit(service.url)
     with contextlib.ExitStack() as stack:
         for path in ("/v1/jobs?limit=200", f"/v1/jobs/{ids[0]}/inputs") * 20:
-            unread = stack.enter_context(socket.create_connection((address.hostname, address.port or 80)))
-            unread.sendall(f"GET {path} HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n".encode())
+            stack.enter_context(connect(service)).sendall(lines(f"GET {path} HTTP/1.1"))
         assert client.get("/v1/jobs?limit=1").json()["next_cursor"] == ids[-1]
     names, cursor = [], "0"
     while cursor is not None:
