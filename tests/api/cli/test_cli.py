@@ -524,6 +524,7 @@ def test_missing_weights_error_names_fetch_command(
         (["--memory-limit", "0GB"], "memory-limit"),
         (["--within", "0s"], "within"),
         (["--unheard-of"], "unheard-of"),
+        (["--orbit", "many"], "unable to parse string as an integer, or 'auto'.\n"),
         (["--scales", "0,0"], "no scale has a weight"),
         (["--scales", "1,-1"], "greater than or equal to 0"),
         (["--scales", "nan"], "finite"),

@@ -113,11 +113,6 @@ def test_bounds_match_across_interfaces(name: str, value: float, sgsst: Sgsst) -
         assert error["msg"] in said
 
 
-def test_orbit_that_is_no_number_is_refused_with_the_word(sgsst: Sgsst) -> None:
-    command = ["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", "--orbit", "many"]
-    assert sgsst(command, 2).endswith("unable to parse string as an integer, or 'auto'.\n")
-
-
 @pytest.mark.parametrize("value", ["nan", "inf", "many", ""])
 def test_non_finite_numbers_are_rejected(value: str, sgsst: Sgsst) -> None:
     for flag in ("--near", "--within", "--workers"):

@@ -224,11 +224,8 @@ def test_jobs_are_listed_page_by_page(
 
 
 @both
-def test_plan_queues_nothing_and_rejects_bad_files(
-    connect: Any, service: Service, paths: dict[str, Path], tmp_path: Path
-) -> None:
+def test_bad_files_are_rejected(connect: Any, service: Service, paths: dict[str, Path], tmp_path: Path) -> None:
     with connect(service.url) as client:
-        before = [job.id for job in client.jobs()]
         with pytest.raises(RequestError, match="is not a scene file") as caught:
             client.plan(paths["style"], paths["style"], orbit=2)
         assert (caught.value.status, caught.value.problem["input"]) == (422, "scene")
@@ -236,7 +233,6 @@ def test_plan_queues_nothing_and_rejects_bad_files(
             client.submit(tmp_path / "none.ply", paths["style"], orbit=2)
         with pytest.raises(RequestError, match="contains no images"):
             client.submit(paths["scene"], paths["style"], cameras=paths["cameras"], photos=tmp_path)
-        assert [job.id for job in client.jobs()] == before
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,6 @@ from service import outgoing, problems
 from service.deadlines import FileThreads
 from service.files.blobs import Blobs, open_blobs
 from service.files.objects import Artifacts
-from service.outgoing import parse_origins
 from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import Store, open_store
@@ -195,12 +194,6 @@ def test_spellings_of_an_allowed_host(url: str, stored: Stored, names: dict[str,
 def test_lists_of_hosts_are_checked_at_the_start(entry: str) -> None:
     with pytest.raises(ValueError, match="is not a host"):
         ServiceSettings(url_hosts=f"files.example, {entry}")
-
-
-def test_origins_of_a_list() -> None:
-    expected = {("https", "files.example", 443), ("http", "minio", 9000), ("https", "2606:4700::1111", 443)}
-    assert parse_origins("files.example,http://minio:9000/, [2606:4700::1111]") == expected
-    assert parse_origins("") == frozenset()
 
 
 @pytest.mark.parametrize(
