@@ -79,11 +79,10 @@ def test_inputs_are_returned_unchanged(client: httpx2.Client, paths: dict[str, P
         answer = client.get(entry["url"])
         assert answer.content == content
         assert entry["sha256"] == hashlib.sha256(content).hexdigest()
-        assert answer.headers["etag"] == f'"{entry["sha256"]}"'
-        assert answer.headers["content-type"] == kind
+        wanted = {"etag": f'"{entry["sha256"]}"', "content-type": kind, "x-content-type-options": "nosniff"}
+        wanted["content-security-policy"] = "sandbox; default-src 'none'"
+        assert wanted.items() <= dict(answer.headers).items()
         assert answer.headers["content-disposition"].startswith("attachment; filename=")
-        assert answer.headers["content-security-policy"] == "sandbox; default-src 'none'"
-        assert answer.headers["x-content-type-options"] == "nosniff"
         assert "private" in answer.headers["cache-control"]
     assert client.get(f"/v1/jobs/{job_id}/inputs/style:0").content == style
 

@@ -1,6 +1,5 @@
 """Tests of dry runs that report their progress."""
 
-import io
 import json
 import math
 from typing import Any
@@ -8,7 +7,6 @@ from typing import Any
 import httpx2
 import pytest
 import torch
-from PIL import Image
 
 from tests.api.http.sending import refused
 from tests.api.service import Service, wait_for
@@ -102,41 +100,6 @@ def blender(**lens: Any) -> bytes:
     ]
     frames[1] |= {"w": 64, "h": 48}
     return json.dumps({"camera_angle_x": 2 * math.atan(0.5), **lens, "frames": frames}).encode()
-
-
-def photo(name: str) -> tuple[str, tuple[str, bytes]]:
-    file = io.BytesIO()
-    Image.linear_gradient("L").resize((128, 96)).save(file, "PNG")
-    return "photos", (name, file.getvalue())
-
-
-@pytest.mark.slow
-def test_plan_lists_camera_and_photo_decisions(client: httpx2.Client, files: dict[str, bytes]) -> None:
-    asked = request({**files, "cameras": blender(k1=0.1)})
-    problem = refused(client.post("/v1/jobs", **asked), 422, "invalid-cameras")
-    assert "gives no size. Add the sizes" in problem["detail"]
-    asked["files"] += [photo("train/view_0.png"), photo("train/view_2.png")]
-    answer = client.post("/v1/jobs", **asked)
-    assert answer.status_code == 200, answer.text
-    lines = [f"{line['item']}: {line['decision']}" for line in answer.json()["plan"]["decisions"]]
-    assert "lenses: the photos are undistorted" in lines
-    assert "photos: warning: 1 of 3 views are left out" in lines
-    assert any(text.startswith("photos: 1 of 3 views are left out: ") for text in answer.json()["warnings"])
-    assert answer.json()["views"] == 2
-
-
-@pytest.mark.slow
-def test_panoramas_are_planned_as_the_faces_that_show_something(client: httpx2.Client, files: dict[str, bytes]) -> None:
-    """The pinhole, the front faces and a side face of each panorama see the scene, a wall before the cameras."""
-    content = json.loads(blender(w=256, h=128))
-    for index in (0, 2):
-        content["frames"][index]["camera_model"] = "EQUIRECTANGULAR"
-    answer = client.post("/v1/jobs", **request({**files, "cameras": json.dumps(content).encode()}))
-    assert answer.status_code == 200, answer.text
-    assert answer.json()["views"] == 13
-    lines = [f"{line['item']}: {line['decision']}: {line['reason']}" for line in answer.json()["plan"]["decisions"]]
-    assert any(line.startswith("cameras: 2 of 3 are panoramas, six views each: ") for line in lines)
-    assert "views: 8 of 13 are skipped: they see no Gaussian" in lines
 
 
 def test_mismatched_cameras_are_rejected_immediately(client: httpx2.Client, files: dict[str, bytes]) -> None:

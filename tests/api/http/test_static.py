@@ -34,10 +34,9 @@ def files() -> StaticFiles:
 def test_pages_reference_existing_files(client: httpx2.Client, path: str, policy: str) -> None:
     answer = client.get(path)
     assert answer.status_code == 200
-    assert answer.headers["content-type"] == "text/html; charset=utf-8"
-    assert answer.headers["content-security-policy"] == policy
-    assert answer.headers["x-content-type-options"] == "nosniff"
-    assert answer.headers["cache-control"] == "no-cache"
+    wanted = {"content-type": "text/html; charset=utf-8", "content-security-policy": policy}
+    wanted |= {"x-content-type-options": "nosniff", "cache-control": "no-cache"}
+    assert wanted.items() <= dict(answer.headers).items()
     assert "{{" not in answer.text
     named = re.findall(r'(?:src|href)="([^"]+)"', answer.text)
     assert not [name for name in named if re.match("(https?:)?//", name)], "something of another site"

@@ -87,3 +87,13 @@ def started(watched: Watched, service: Service, name: str = "Start") -> dict[str
     watched.page.wait_for_url(re.compile("#/jobs/job_"))
     job: dict[str, Any] = httpx2.get(f"{service.url}/v1/jobs/{answer.value.json()['id']}").json()
     return job
+
+
+def fetched(service: Service, path: str, to: Path) -> Path:
+    """Download a file of the service."""
+    to.write_bytes(httpx2.get(f"{service.url}{path}").raise_for_status().content)
+    return to
+
+
+def result_of(service: Service, job_id: str, folder: Path) -> Path:
+    return fetched(service, f"/v1/jobs/{job_id}/artifacts/stylized.ply", folder / f"{job_id}.ply")

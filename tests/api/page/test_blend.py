@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import httpx2
 import numpy as np
 import pytest
 import torch
@@ -15,7 +14,7 @@ from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.files.stylized_ply import blend_scenes, write_colors, write_stylized
 from sgsst_core.scene.camera import resized
-from tests.api.page.actions import Visit, done, submit
+from tests.api.page.actions import Visit, done, result_of, submit
 from tests.api.page.browser import Watched, decoded, psnr, rendered
 from tests.api.page.test_page import frame_of
 from tests.api.page.test_viewer import FAITHFUL, real_scene, shown
@@ -144,9 +143,7 @@ def test_two_results_are_blended(
     move(watched, "Amount of style", 80)
     watched.settled()
     path = saved(watched, tmp_path)
-    paths = [tmp_path / f"{job_id}.ply" for job_id in pair]
-    for job_id, file in zip(pair, paths, strict=True):
-        file.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    paths = [result_of(service, job_id, tmp_path) for job_id in pair]
     expected = blend_scenes([read_scene(file) for file in (*paths, inputs["scene"])], [0.6, 0.2, 0.2])
     assert torch.allclose(read_scene(path).scene.sh_dc, expected.scene.sh_dc, atol=1e-6)
 

@@ -24,6 +24,7 @@ from tests.api.page.actions import (
     done,
     drop,
     expand,
+    result_of,
     set_options,
     submit,
 )
@@ -70,9 +71,7 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
 
     page.get_by_label("Camera", exact=True).select_option("1")
     camera = resized(read_cameras(files["cameras"])[1], 384)
-    result = tmp_path / "stylized.ply"
-    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
-    original, stylized = rendered(files["scene"], camera), rendered(result, camera)
+    original, stylized = (rendered(path, camera) for path in (files["scene"], result_of(service, job_id, tmp_path)))
     watched.wipe("End")
     before = frame_of(watched, original)
     watched.wipe("Home")

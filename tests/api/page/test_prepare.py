@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from sgsst_core.files.scene_file import read_scene
-from tests.api.page.actions import REFUSED, STEPS, Visit, choose, done, set_options, started
+from tests.api.page.actions import REFUSED, STEPS, Visit, choose, done, result_of, set_options, started
 from tests.api.page.browser import Watched, appear, click
 from tests.api.service import Service
 from tests.sgsst_core.objects import box, joined, scene_of
@@ -113,8 +113,7 @@ def test_scene_is_turned_and_cropped(visit: Visit, service: Service, files: dict
     assert up in ("z", "-z")
     assert [(region["name"], region.get("freeze", False)) for region in regions] == [("inside", False), ("rest", True)]
     low, high = np.array(regions[0]["select"].removeprefix("box=").split(","), dtype=float).reshape(2, 3)
-    out = tmp_path / "stylized.ply"
-    out.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{done(service, job['id'])}/artifacts/stylized.ply").content)
+    out = result_of(service, done(service, job["id"]), tmp_path)
     before, after = read_scene(files["scene"]).scene, read_scene(out).scene
     inside = ((before.means.numpy() >= low) & (before.means.numpy() <= high)).all(axis=1)
     painted = (before.sh_dc != after.sh_dc).any(dim=1).numpy()

@@ -12,7 +12,7 @@ import pytest
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import RESULT_FORMATS, read_scene_header
 from sgsst_core.scene.camera import resized
-from tests.api.page.actions import LONG, STEPS, Visit, done, drop, submit
+from tests.api.page.actions import LONG, STEPS, Visit, done, drop, result_of, submit
 from tests.api.page.browser import FLAGS, Watched, appear, chromium, click, psnr, rendered
 from tests.api.page.test_page import frame_of
 from tests.api.service import Service, wait_for
@@ -320,8 +320,7 @@ def test_view_of_a_running_job_becomes_its_result(visit: Visit, service: Service
     page.locator(".side.right", has_text="Stylized").wait_for()
     assert page.locator("canvas.view").get_attribute("id") == "same"
     page.get_by_label("Amount of style").wait_for()
-    result = files["scene"].with_name("result.ply")
-    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{done(service, job_id)}/artifacts/stylized.ply").content)
+    result = result_of(service, done(service, job_id), files["scene"].parent)
     wanted = rendered(result, resized(read_cameras(files["cameras"])[1], 384))
     watched.wipe("Home")
     assert psnr(frame_of(watched, wanted), wanted) > 38

@@ -18,7 +18,7 @@ from PIL.PngImagePlugin import PngInfo
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from tests.api.page.actions import STEPS, Visit, choose, done, drop, set_options, submit
+from tests.api.page.actions import STEPS, Visit, choose, done, drop, fetched, result_of, set_options, submit
 from tests.api.page.browser import Watched, appear, click, psnr, rendered
 from tests.api.page.test_viewer import FAITHFUL, base_of
 from tests.api.service import Service
@@ -278,9 +278,7 @@ def test_selected_region_stays_frozen(visit: Visit, service: Service, files: dic
     mask = httpx2.get(f"{service.url}/v1/jobs/{job_id}/inputs/mask").content
     frozen = np.unpackbits(np.frombuffer(mask, np.uint8), bitorder="little").astype(bool)[:616]
     assert 10 < frozen.sum() == count < 600
-    result = tmp_path / "stylized.ply"
-    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
-    before, after = read_scene(files["scene"]).scene, read_scene(result).scene
+    before, after = (read_scene(path).scene for path in (files["scene"], result_of(service, job_id, tmp_path)))
     same = (before.sh_dc.numpy().view(np.uint32) == after.sh_dc.numpy().view(np.uint32)).all(axis=1)
     assert same[frozen].all()
     assert same[~frozen].mean() < 0.5
@@ -340,16 +338,6 @@ def finished(service: Service, inputs: dict[str, Path]) -> str:
     return done(service, submit(service, inputs, name="wall", **QUICK))
 
 
-def fetched(service: Service, path: str, to: Path) -> Path:
-    """Download a file of the service."""
-    to.write_bytes(httpx2.get(f"{service.url}{path}").raise_for_status().content)
-    return to
-
-
-def result(service: Service, job_id: str, folder: Path) -> Path:
-    return fetched(service, f"/v1/jobs/{job_id}/artifacts/stylized.ply", folder / f"{job_id}.ply")
-
-
 def camera_of(view: dict[str, Any]) -> Camera:
     """Return the camera that a request or a picture states."""
     stated = view["camera"]
@@ -387,7 +375,7 @@ def applied(watched: Watched) -> dict[str, Any]:
 def test_scene_follows_a_stroke_and_undo_restores_it(
     visit: Visit, service: Service, finished: str, tmp_path: Path
 ) -> None:
-    base = result(service, finished, tmp_path)
+    base = result_of(service, finished, tmp_path)
     digest = hashlib.sha256(base.read_bytes()).hexdigest()
     watched = visit(f"/#/jobs/{finished}", width=1100, height=800)
     page = watched.page
@@ -409,7 +397,7 @@ def test_scene_follows_a_stroke_and_undo_restores_it(
     assert abs(rows.mean() / height - 0.5) < 0.01
     assert abs(columns.mean() / width - 0.5) < 0.01
     [view] = job["parameters"]["painted"]
-    camera, painted = camera_of(view), result(service, job["id"], tmp_path)
+    camera, painted = camera_of(view), result_of(service, job["id"], tmp_path)
     before, after = rendered(base, camera), rendered(painted, camera)
     color = np.broadcast_to(layer[stroke][0, :3].astype(float), after[stroke].shape)
     assert psnr(after[stroke], color) > psnr(before[stroke], color) + 6
@@ -424,7 +412,7 @@ def test_scene_follows_a_stroke_and_undo_restores_it(
     watched.wipe("Home")
     shown = watched.pixels()
     assert psnr(shown, rendered(base, of_canvas(camera, shown))) >= FAITHFUL, "the same viewpoint"
-    assert hashlib.sha256(result(service, finished, tmp_path).read_bytes()).hexdigest() == digest
+    assert hashlib.sha256(result_of(service, finished, tmp_path).read_bytes()).hexdigest() == digest
 
 
 def test_painted_picture_returns_to_its_view(visit: Visit, service: Service, finished: str, tmp_path: Path) -> None:
@@ -437,7 +425,7 @@ def test_painted_picture_returns_to_its_view(visit: Visit, service: Service, fin
     with Image.open(download.value.path()) as image:
         stated, pixels = image.info["sgsst-view"], np.asarray(image.convert("RGB"), dtype=np.float64)
     camera = camera_of(json.loads(stated))
-    before = rendered(result(service, finished, tmp_path), camera)
+    before = rendered(result_of(service, finished, tmp_path), camera)
     assert psnr(pixels, before) >= FAITHFUL
     panel.get_by_role("button", name="Cancel").click()
     page.locator("canvas.view").focus()
@@ -451,7 +439,7 @@ def test_painted_picture_returns_to_its_view(visit: Visit, service: Service, fin
     panel.locator("button:enabled", has_text="Apply").wait_for()
     job = applied(watched)
     assert job["parameters"]["painted"] == [json.loads(stated)]
-    painted = rendered(result(service, job["id"], tmp_path), camera)
+    painted = rendered(result_of(service, job["id"], tmp_path), camera)
     assert psnr(painted, night) > psnr(before, night) + 10
 
 

@@ -127,21 +127,6 @@ def test_stored_bytes_count_uploads_inputs_and_results(store: Store, clock: Cloc
     submit(store, quotas)
 
 
-def test_derived_files_are_charged_before_they_are_stored(store: Store) -> None:
-    job_id, quotas = submit(store, NO_QUOTAS), Quotas(stored_bytes=11)
-    store.leases.succeed(lease(store), [Published("stylized.ply", "x/1", 4, SHA)], {})
-    result, blend = store.jobs.artifact(job_id, "stylized.ply"), Published("blends/a.ply", "x/2", 4, SHA)
-    assert result is not None
-    receipt = store.inputs.open_receipt("local", blend.size, quotas)
-    assert usage_of(store, "local").stored_bytes == 11
-    with raises_problem(problems.QUOTA_EXCEEDED):
-        store.inputs.open_receipt("local", blend.size, quotas)
-    assert store.jobs.add_derived(result, [blend], "local", quotas, receipt=receipt) == []
-    assert usage_of(store, "local").stored_bytes == 11
-    store.inputs.end_receipt(receipt)
-    assert usage_of(store, "local").stored_bytes == 11
-
-
 def test_upload_used_as_an_input_counts_once(store: Store) -> None:
     row = store.inputs.create_upload("local", 3, "scene.ply", "", 1000)
     store.inputs.finish_upload(row.id, SHA, 1000)

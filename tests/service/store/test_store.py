@@ -246,40 +246,6 @@ def test_job_that_fails_at_the_same_step_is_given_up(store: Store, clock: Clock)
     assert [fail_at(store, clock, 90) for _ in range(ATTEMPTS)] == [True, True, False]
 
 
-def test_ended_jobs_are_swept_once(store: Store) -> None:
-    job_id, never_run = queue(store), queue(store)
-    store.jobs.cancel(never_run, "local")
-    store.leases.fail(lease(store), {"code": "x", "message": "x"}, permanent=True)
-    assert sorted(store.retention.unswept(10)) == sorted([(job_id, 1), (never_run, 0)])
-    assert len(store.retention.unswept(1)) == 1
-    store.retention.mark_swept(never_run, 0)
-    store.jobs.retry(job_id, "local", limit=10)
-    store.retention.mark_swept(job_id, 1)  # too late: the job has been queued again
-    store.leases.succeed(lease(store), [], {})
-    store.retention.mark_swept(job_id, 1)  # of an earlier lease
-    assert store.retention.unswept(10) == [(job_id, 2)]
-    store.retention.mark_swept(job_id, 2)
-    assert store.retention.unswept(10) == []
-
-
-def test_dispatchers_are_alive_while_they_send_heartbeats(store: Store, clock: Clock) -> None:
-    operations = store.operations
-    operations.record_heartbeat("one", 8, 8)
-    clock.now += LEASE / 2
-    operations.record_heartbeat("two", 4, 0)
-    operations.record_heartbeat("one", 8, 3)
-    assert [(row.name, row.slots, row.free) for row in operations.dispatchers()] == [("one", 8, 3), ("two", 4, 0)]
-    operations.remove_dispatcher("one")
-    assert [row.name for row in operations.dispatchers()] == ["two"]
-    clock.now += LEASE + 1
-    assert operations.dispatchers() == []
-    clock.now += 2 * 86_400
-    operations.record_heartbeat("three", 1, 1)
-    store.retention.expire()
-    with store.database.reading() as session:
-        assert session.connection().exec_driver_sql("SELECT name FROM dispatchers").scalars().all() == ["three"]
-
-
 def test_old_progress_events_are_deleted_but_not_status_events(store: Store) -> None:
     queue(store)
     held = lease(store)
