@@ -1,13 +1,13 @@
 """Candidates for defaults on several pairs of scene and painting, judged on pairs that they were not chosen on.
 
-python -m benchmarks.cross_validation run DATA [--seconds 240] [--workers 6]
+python -m benchmarks.cross_validation run DATA [--workers 6]
 python -m benchmarks.cross_validation show
 
 `run` needs a folder with scenes/ and styles/ (`SCENES`, `PAIRS`); the demo scene is built. It stylizes every pair with
 the defaults, then pair by pair with every candidate (`CANDIDATES`), after the same number of steps, on a GPU if there
 is one. Results are judged on novel views by a network outside the loss, always on the CPU, so that machines compare,
 and added to benchmarks/results/cross_validation.json. With `--at 40 80 160`, the default is also judged after these
-steps of the same run. After `--seconds`, no further run starts.
+steps of the same run.
 
 `show` prints Markdown tables of what is stored. The score of a candidate on a pair is the mean logarithm of the ratios
 of its `SCORED` figures to the default's; negative is better. Leaving out: for each pair, the candidate with the best
@@ -120,7 +120,6 @@ def main() -> None:
     running.add_argument("--resolution", type=int, default=384, help="of the views of a run")
     running.add_argument("--settings", default="{}", help="JSON, of all runs")
     running.add_argument("--workers", type=int, default=1)
-    running.add_argument("--seconds", type=float, default=math.inf)
     arguments = parse(parser)
     if arguments.way == "run" and (unknown := set(arguments.pairs) - set(PAIRS)):
         parser.error(f"unknown pairs: {', '.join(sorted(unknown))}. Choose some of: {'; '.join(PAIRS)}")
@@ -143,23 +142,19 @@ def run_all(arguments: argparse.Namespace) -> None:
             if name in CANDIDATES and (name not in SCANS_ONLY or pair.startswith(SCANS)):
                 tasks.append(Task(arguments.data, pair, name, base | CANDIDATES[name], arguments.resolution))
     description = {"steps": arguments.steps, "resolution": arguments.resolution, "settings": base}
-    end = time.monotonic() + arguments.seconds
     threads = max(1, (os.cpu_count() or 1) // arguments.workers)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(arguments.workers, context, torch.set_num_threads, (threads,)) as pool:
-        futures = {pool.submit(run, task, end): task for task in tasks}
+        futures = {pool.submit(run, task): task for task in tasks}
         for future in as_completed(futures):
             task, rows = futures[future], future.result()
-            if rows:
-                name = f"{task.pair}, {arguments.steps} steps at {arguments.resolution} pixels"
-                add_pair("cross_validation", name, {"pair": task.pair, **description}, rows, presets=["standard"])
-                print(f"{task.pair:40} {task.candidate:12}", *_cells(list(rows.values())[-1]), flush=True)
+            name = f"{task.pair}, {arguments.steps} steps at {arguments.resolution} pixels"
+            add_pair("cross_validation", name, {"pair": task.pair, **description}, rows, presets=["standard"])
+            print(f"{task.pair:40} {task.candidate:12}", *_cells(list(rows.values())[-1]), flush=True)
 
 
-def run(task: Task, end: float) -> Rows:
-    """Run and judge a candidate; return no rows if it is later than `end` on the monotonic clock."""
-    if time.monotonic() > end:
-        return {}
+def run(task: Task) -> Rows:
+    """Run and judge a candidate."""
     scene_name, painting = task.pair.split(", ")
     scene, cameras, novel = inputs(task.data, scene_name, task.resolution)
     style = load_image(task.data / "styles" / f"{painting}.jpg")

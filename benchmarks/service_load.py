@@ -1,10 +1,10 @@
 """Load that the API sustains while a job runs on the same machine: submissions, status requests, watchers, an upload.
 
-python -m benchmarks.service_load [--upload-mb 2000] [--watchers 1000] [--seconds 20] [--postgresql]
+python -m benchmarks.service_load [--postgresql]
 
 Targets: 100 submissions per second of jobs whose files are already uploaded; 200 status requests per second with a 99th
 percentile latency under 50 ms; 1000 watchers of server-sent events; memory growth of the API of less than 64 MB during
-an upload of 2 GB. The client runs on the same machine; its CPU time is reported separately.
+an upload of 2 GB. The client runs on the same machine.
 
 With --postgresql, the database is a PostgreSQL server with durable commits. Two API processes share it, and requests
 and watchers alternate between them, so half of the watchers receive the running job's events through the other API
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import base64
 import contextlib
 import json
 import os
@@ -24,7 +23,7 @@ import statistics
 import tempfile
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,9 @@ import httpx2
 import psutil
 import uvloop
 
+from api.client import AsyncClient
 from benchmarks.common import add_pair, parse
+from tests.api.http.sending import OFFSET_STREAM, TUS
 from tests.api.service import Service
 from tests.postgres import fresh_database, server
 from tests.small_scenes import wall, write_files
@@ -48,23 +49,10 @@ SETTINGS: dict[str, Any] = {
     "SGSST_MAX_JOBS_PER_KEY": "1000000",
     "SGSST_MIN_FREE_BYTES": "1000000000",
 }
-_TUS = {"Tus-Resumable": "1.0.0"}
-_API = "api.http.server"
 _SUBMITTERS, _STATUS_CONNECTIONS = 16, 32
 _PIECE = 1 << 20
-
-
-async def upload(client: httpx2.AsyncClient, path: Path) -> str:
-    """Upload a small file, and return the upload's id."""
-    name = base64.b64encode(path.name.encode()).decode()
-    length = str(path.stat().st_size)
-    begun = await client.post(
-        "/v1/uploads", headers=_TUS | {"Upload-Length": length, "Upload-Metadata": f"filename {name}"}
-    )
-    begun.raise_for_status()
-    headers = _TUS | {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
-    (await client.patch(begun.headers["location"], content=path.read_bytes(), headers=headers)).raise_for_status()
-    return str(begun.json()["id"])
+#: Bytes of the upload, number of watchers, and seconds of each measurement.
+_UPLOAD, _WATCHERS, _SECONDS = 2_000_000_000, 1000, 20.0
 
 
 class Connection:
@@ -112,11 +100,11 @@ class Connection:
         return f"{method} {path} HTTP/1.1\r\nHost: {self._host}:{self._port}\r\n{kind}\r\n".encode()
 
 
-async def submissions(urls: Sequence[str], body: dict[str, Any], seconds: float, created: list[str]) -> dict[str, Any]:
-    """Submit jobs with uploaded files from several clients, as fast as possible, and append their ids to `made`."""
+async def submissions(urls: Sequence[str], body: dict[str, Any], created: list[str]) -> dict[str, Any]:
+    """Submit jobs with uploaded files from several clients, as fast as possible, and append their ids to `created`."""
     took: list[float] = []
     failures: Counter[str] = Counter()
-    end = time.perf_counter() + seconds
+    end = time.perf_counter() + _SECONDS
 
     async def submit(number: int) -> None:
         connection = Connection(urls[number % len(urls)])
@@ -185,35 +173,9 @@ async def at_a_rate(urls: Sequence[str], path: Callable[[int], str], rate: float
     }
 
 
-async def with_processor(apis: list[psutil.Process], work: Awaitable[dict[str, Any]], count: str) -> dict[str, Any]:
-    """Await the figures of `work`, and add the CPU time of API and client per request.
-
-    Unlike wall-clock time, CPU time hardly depends on the machine's other load.
-    """
-    processes = {"api": apis, "client": [psutil.Process()]}
-    before = {name: _processor_seconds(some) for name, some in processes.items()}
-    figures = await work
-    for name, some in processes.items():
-        used = _processor_seconds(some) - before[name]
-        figures[f"{name}_cpu_ms_each"] = round(1000 * used / max(1, figures[count]), 2)
-    return figures
-
-
-def _processor_seconds(processes: list[psutil.Process]) -> float:
-    return sum(times.user + times.system for times in (process.cpu_times() for process in processes))
-
-
-def _memory(processes: list[psutil.Process]) -> int:
-    return sum(int(process.memory_info().rss) for process in processes)
-
-
-async def watch(
-    urls: Sequence[str], job_id: str, count: int, seconds: float, apis: list[psutil.Process]
-) -> dict[str, Any]:
+async def watch(urls: Sequence[str], job_id: str) -> dict[str, Any]:
     """Watch one running job with many clients, and return the number of connected clients and the delay of events."""
-    before = _memory(apis)
     late: list[float] = []
-    events = [0] * count
     connected = 0
     opened = float("inf")  # events before this time do not count
 
@@ -227,34 +189,24 @@ async def watch(
                     connected += 1
                 elif line.startswith(b"data: ") and time.time() > opened:
                     updated = _moment(json.loads(line[6:]).get("updated_at"))
-                    if updated > opened:
-                        events[number] += 1
-                        late.append(time.time() - updated)
+                    late.extend([time.time() - updated] * (updated > opened))
         finally:
             connection.close()
 
-    tasks = [asyncio.create_task(one(number)) for number in range(count)]
+    tasks = [asyncio.create_task(one(number)) for number in range(_WATCHERS)]
     deadline = time.monotonic() + 120
-    while connected < count and time.monotonic() < deadline and not any(task.done() for task in tasks):
+    while connected < _WATCHERS and time.monotonic() < deadline and not any(task.done() for task in tasks):
         await asyncio.sleep(0.1)
     opened = time.time()
-    grown = _memory(apis) - before
-    await asyncio.sleep(seconds)
+    await asyncio.sleep(_SECONDS)
     alive = sum(not task.done() for task in tasks)
     for task in tasks:
         task.cancel()
     for ended in await asyncio.gather(*tasks, return_exceptions=True):
         if isinstance(ended, Exception) and not isinstance(ended, OSError):
             raise ended
-    return {
-        "wanted": count,
-        "connected": connected,
-        "still_connected": alive,
-        "api_grown_mb": round(grown / 1e6, 1),
-        "events_received": sum(events),
-        "watchers_without_an_event": sum(not each for each in events),
-        "delay": spread(late) if late else None,
-    }
+    delay = spread(late) if late else None
+    return {"wanted": _WATCHERS, "connected": connected, "still_connected": alive, "delay": delay}
 
 
 def _moment(timestamp: str | None) -> float:
@@ -265,7 +217,7 @@ def _moment(timestamp: str | None) -> float:
 async def large_upload(client: httpx2.AsyncClient, path: Path, api: psutil.Process) -> dict[str, Any]:
     """Upload a large file in one request, and measure the API's memory meanwhile."""
     size = path.stat().st_size
-    begun = await client.post("/v1/uploads", headers=_TUS | {"Upload-Length": str(size)})
+    begun = await client.post("/v1/uploads", headers=TUS | {"Upload-Length": str(size)})
     begun.raise_for_status()
     before = most = api.memory_info().rss
     done = asyncio.Event()
@@ -283,7 +235,7 @@ async def large_upload(client: httpx2.AsyncClient, path: Path, api: psutil.Proce
 
     looking = asyncio.create_task(look())
     started = time.perf_counter()
-    headers = _TUS | {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+    headers = TUS | {"Upload-Offset": "0", "Content-Type": OFFSET_STREAM}
     answer = await client.patch(begun.headers["location"], content=pieces(), headers=headers, timeout=1200)
     seconds = time.perf_counter() - started
     done.set()
@@ -304,56 +256,36 @@ def spread(values: list[float]) -> dict[str, float]:
     return {f"p{name}_ms": round(1000 * cuts[index], 1) for name, index in (("50", 499), ("95", 949), ("99", 989))}
 
 
-async def measure(
-    services: Sequence[Service], files: dict[str, Path], arguments: argparse.Namespace, large: Path
-) -> dict[str, Any]:
+async def measure(services: Sequence[Service], files: dict[str, Path], large: Path) -> dict[str, Any]:
     """Measure all figures one after the other. The first of the services has the dispatcher."""
     service, urls = services[0], [each.url for each in services]
-    apis = [process for each in services for process in each.processes(_API)]
-    async with httpx2.AsyncClient(base_url=service.url, timeout=120) as client:
-        ids = {role: await upload(client, path) for role, path in files.items()}
+    api = service.processes("api.http.server")[0]
+    figures: dict[str, Any] = {}
+    async with AsyncClient(service.url) as uploads, httpx2.AsyncClient(base_url=service.url, timeout=120) as client:
+        ids = {role: await uploads.upload(path) for role, path in files.items()}
         body = {"scene": ids["scene"], "style": ids["style"], "cameras": [ids["cameras"]], "parameters": LONG}
         running = (await client.post("/v1/jobs", json=body)).json()["id"]
         await _until_it_runs(client, running)
-        figures: dict[str, Any] = {"job_steps_per_second_alone": await _speed(client, running, arguments.seconds / 2)}
-        print(figures, flush=True)
         # The upload comes before the watchers, whose freed memory in the API's heap would hide its growth.
-        figures["upload"] = await large_upload(client, large, apis[0])
-        print(figures["upload"], flush=True)
-        asking = at_a_rate(urls, lambda number: f"/v1/jobs/{running}", 200, arguments.seconds)
-        figures["status"] = await with_processor(apis, asking, "requests")
-        print(figures["status"], flush=True)
-        figures["watchers"] = await watch(urls, running, arguments.watchers, arguments.seconds, apis)
-        print(figures["watchers"], flush=True)
+        figures["upload"] = await large_upload(client, large, api)
+        figures["status"] = await at_a_rate(urls, lambda number: f"/v1/jobs/{running}", 200, _SECONDS)
+        figures["watchers"] = await watch(urls, running)
         created: list[str] = []
-        submitting = submissions(urls, body, arguments.seconds, created)
-        figures["submissions"] = await with_processor(apis, submitting, "accepted")
-        print(figures["submissions"], flush=True)
-        asking = at_a_rate(
-            urls, lambda number: f"/v1/jobs/{created[number % len(created)]}", 200, arguments.seconds / 2
+        figures["submissions"] = await submissions(urls, body, created)
+        figures["status_of_queued_jobs"] = await at_a_rate(
+            urls, lambda number: f"/v1/jobs/{created[number % len(created)]}", 200, _SECONDS / 2
         )
-        figures["status_of_queued_jobs"] = await with_processor(apis, asking, "requests")
-        print(figures["status_of_queued_jobs"], flush=True)
-        figures["job_still_running"] = (await client.get(f"/v1/jobs/{running}")).json()["status"] == "running"
-    figures["api_memory_mb"] = round(_memory(apis) / 1e6, 1)
+    print(json.dumps(figures, indent=2))
     return figures
 
 
 async def _until_it_runs(client: httpx2.AsyncClient, job_id: str) -> None:
-    while (job := (await client.get(f"/v1/jobs/{job_id}")).json())["status"] != "running" or not job["progress"][
-        "step"
-    ]:
+    job: dict[str, Any] = {"status": "queued"}
+    while job["status"] != "running" or not job["progress"]["step"]:
+        await asyncio.sleep(0.5)
+        job = (await client.get(f"/v1/jobs/{job_id}")).json()
         if job["status"] == "failed":
             raise RuntimeError(job["error"])
-        await asyncio.sleep(0.5)
-
-
-async def _speed(client: httpx2.AsyncClient, job_id: str, seconds: float) -> float:
-    steps = []
-    for wait in (seconds, 0):
-        steps.append((await client.get(f"/v1/jobs/{job_id}")).json()["progress"]["step"])
-        await asyncio.sleep(wait)
-    return round((steps[1] - steps[0]) / seconds, 1)
 
 
 def _services(folder: Path, stack: contextlib.ExitStack, postgresql: bool) -> list[Service]:
@@ -368,9 +300,6 @@ def _services(folder: Path, stack: contextlib.ExitStack, postgresql: bool) -> li
 def main() -> None:
     """Measure, then print and store the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--upload-mb", type=int, default=2000)
-    parser.add_argument("--watchers", type=int, default=1000)
-    parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--postgresql", action="store_true", help="two API processes on a PostgreSQL server")
     arguments = parse(parser)
     with contextlib.ExitStack() as stack:
@@ -379,7 +308,7 @@ def main() -> None:
         ply, cameras, style = write_files(folder / "inputs", wall())
         large = folder / "large"
         large.touch()
-        os.truncate(large, arguments.upload_mb * 1_000_000)  # sparse: it needs no space on disk
+        os.truncate(large, _UPLOAD)  # sparse: it needs no space on disk
         # Raise the limit of open files for 1000 watchers, here and in the service.
         with contextlib.suppress(ValueError, OSError):
             import resource
@@ -388,7 +317,7 @@ def main() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
         services = [stack.enter_context(each) for each in _services(folder, stack, arguments.postgresql)]
         files = {"scene": ply, "cameras": cameras, "style": style}
-        figures = uvloop.run(measure(services, files, arguments, large))
+        figures = uvloop.run(measure(services, files, large))
     print(add_pair("service_load", "postgresql" if arguments.postgresql else "sqlite", {}, figures))
 
 
