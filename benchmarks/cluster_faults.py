@@ -1,6 +1,6 @@
 """Random machine failures in a cluster that runs small jobs and shares only PostgreSQL and S3.
 
-python -m benchmarks.cluster_faults [--faults 60] [--seconds S] [--seed 0] [--kinds kill-node cut-node ...]
+python -m benchmarks.cluster_faults
 
 The cluster has ten simulated hosts, which are Linux namespaces with their own network,
 processes and disk: two for the API, two for dispatchers, one for Ray's head, three Ray nodes that compute, one for
@@ -32,7 +32,6 @@ import selectors
 import shutil
 import signal
 import socket
-import statistics
 import struct
 import subprocess
 import sys
@@ -43,19 +42,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import httpx2
 
 from benchmarks.common import parse, write_result
-from benchmarks.service_kills import FINISHED, Attacked
+from benchmarks.service_kills import FINISHED, Attacked, spread
 from tests.api.service import undisturbed
 from tests.networks import install_tiny_weights
+from tests.postgres import programs_folder
 from tests.small_scenes import wall, write_files
 
 PARAMETERS = {"preset": "standard", "steps_coarse": 0, "steps_sos": 150, "backbone": "vgg16", "early_stop": False}
 SEEDS = (1, 2)
-#: Number of unfinished jobs to maintain; every third job runs on two ranks.
-QUEUE, TWO_RANKS_EVERY = 3, 3
+#: Number of unfinished jobs to maintain; every third job runs on two ranks. Number of faults.
+QUEUE, TWO_RANKS_EVERY, FAULTS = 3, 3, 60
 RAY_PORT, PG_PORT, S3_PORT, API_PORT = 6479, 5498, 5599, 8000
 NODES, DISPATCHERS, APIS = ("n1", "n2", "n3"), ("d1", "d2"), ("a1", "a2")
 #: Durations of faults in seconds: network cut (minimum, maximum), S3 outage, slow connection, full disk.
@@ -160,7 +161,7 @@ class Cluster:
         ]
 
     def _start_database(self, host: Host) -> None:
-        programs = _postgres_programs()
+        programs = programs_folder()
         data = host.disk / "data"
         user = ["setpriv", "--reuid", "postgres", "--regid", "postgres", "--clear-groups"]
         host.call("chmod", "755", str(host.disk))
@@ -180,14 +181,6 @@ class Cluster:
         """Return whether PostgreSQL accepts connections."""
         with socket.create_connection((self["pg"].address, PG_PORT), timeout=2):
             return True
-
-
-def _postgres_programs() -> Path:
-    initdb = shutil.which("initdb")
-    places = [Path(initdb).resolve()] if initdb else sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
-    if not places:
-        raise RuntimeError("initdb is missing: apt-get install -y postgresql")
-    return places[-1].parent
 
 
 def _ready(url: str) -> bool:
@@ -256,7 +249,8 @@ class Run(Attacked):
         self.wait_for_steps(120)
         time.sleep(self.chance.uniform(0, 4))
         began = time.monotonic()
-        details = getattr(self, "_" + kind.replace("-", "_"))()
+        fault, hosts = KINDS[kind]
+        details = fault(self, hosts)
         mended = time.monotonic()
         self.fill()
         again = self.wait_for_steps(300)
@@ -281,25 +275,16 @@ class Run(Attacked):
             before = min(before, now)
         return None
 
-    def _kill(self, name: str) -> dict[str, Any]:
+    def kill(self, names: Sequence[str]) -> dict[str, Any]:
+        """Kill a host, and restart it."""
+        name = self.chance.choice(names)
         self.cluster[name].kill()
         time.sleep(self.chance.uniform(1, 8))
         self.cluster.bring_back(name)
         return {"host": name}
 
-    def _kill_node(self) -> dict[str, Any]:
-        return self._kill(self.chance.choice(NODES))
-
-    def _kill_dispatcher(self) -> dict[str, Any]:
-        return self._kill(self.chance.choice(DISPATCHERS))
-
-    def _kill_api(self) -> dict[str, Any]:
-        return self._kill(self.chance.choice(APIS))
-
-    def _kill_head(self) -> dict[str, Any]:
-        return self._kill("head")
-
-    def _cut(self, names: tuple[str, ...]) -> dict[str, Any]:
+    def cut(self, names: Sequence[str]) -> dict[str, Any]:
+        """Cut the connection of a host in one direction or both."""
         name, seconds = self.chance.choice(names), self.chance.uniform(*CUT)
         cable, ways = self.cluster[name].cable, self.chance.choice(("both", "to", "from"))
         cable.to_host.cut, cable.from_host.cut = ways != "from", ways != "to"
@@ -307,112 +292,94 @@ class Run(Attacked):
         cable.mend()
         return {"host": name, "ways": ways}
 
-    def _cut_node(self) -> dict[str, Any]:
-        return self._cut(NODES)
-
-    def _cut_dispatcher(self) -> dict[str, Any]:
-        return self._cut(DISPATCHERS)
-
-    def _slow(self) -> dict[str, Any]:
-        name = self.chance.choice((*NODES, *DISPATCHERS))
+    def slow(self, names: Sequence[str]) -> dict[str, Any]:
+        """Delay and lose packets of a host."""
+        name = self.chance.choice(names)
         for way in (self.cluster[name].cable.to_host, self.cluster[name].cable.from_host):
             way.delay, way.loss = DELAY / 2, LOSS
         time.sleep(SLOW)
         self.cluster[name].cable.mend()
         return {"host": name}
 
-    def _fill_disk(self) -> dict[str, Any]:
-        name = self.chance.choice((*NODES, *DISPATCHERS))
+    def fill_disk(self, names: Sequence[str]) -> dict[str, Any]:
+        """Fill the disk of a host."""
+        name = self.chance.choice(names)
         full = self.cluster[name].disk / "full"
         self.cluster[name].call("dd", "if=/dev/zero", f"of={full}", "bs=1M", "count=4096")
         time.sleep(FULL)
         self.cluster[name].call("rm", "-f", str(full))
         return {"host": name}
 
-    def _restart_database(self) -> dict[str, Any]:
+    def restart(self, names: Sequence[str]) -> dict[str, Any]:
+        """Restart PostgreSQL on its host."""
         self.database_away = True
-        self.cluster["pg"].call("pkill", "-INT", "-o", "postgres")
+        self.cluster[names[0]].call("pkill", "-INT", "-o", "postgres")
         time.sleep(1)
         _wait("PostgreSQL", self.cluster.database_answers)
         time.sleep(3)
         self.database_away = False
         return {}
 
-    def _lose_store(self) -> dict[str, Any]:
-        cable = self.cluster["s3"].cable
+    def lose(self, names: Sequence[str]) -> dict[str, Any]:
+        """Cut the connection of a host in both directions, for `AWAY` seconds."""
+        cable = self.cluster[names[0]].cable
         cable.to_host.cut = cable.from_host.cut = True
         time.sleep(AWAY)
         cable.mend()
         return {}
 
 
-KINDS = (
-    "kill-node",
-    "cut-node",
-    "kill-dispatcher",
-    "cut-dispatcher",
-    "kill-head",
-    "slow",
-    "fill-disk",
-    "restart-database",
-    "lose-store",
-    "kill-api",
-)
+#: What each kind of fault does, and the hosts that it may strike.
+KINDS: dict[str, tuple[Callable[[Run, Sequence[str]], dict[str, Any]], Sequence[str]]] = {
+    "kill-node": (Run.kill, NODES),
+    "cut-node": (Run.cut, NODES),
+    "kill-dispatcher": (Run.kill, DISPATCHERS),
+    "cut-dispatcher": (Run.cut, DISPATCHERS),
+    "kill-head": (Run.kill, ["head"]),
+    "slow": (Run.slow, NODES + DISPATCHERS),
+    "fill-disk": (Run.fill_disk, NODES + DISPATCHERS),
+    "restart-database": (Run.restart, ["pg"]),
+    "lose-store": (Run.lose, ["s3"]),
+    "kill-api": (Run.kill, APIS),
+}
 
 
 def main() -> None:
     """Inject faults, then print and store the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--faults", type=int, default=60)
-    parser.add_argument("--seconds", type=float, default=None, help="no further fault after these")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
-    parser.add_argument("--logs", type=Path, help="folder that the hosts' logs are copied to")
-    arguments = parse(parser)
+    parse(argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter))
     if reason := missing():
         raise SystemExit(reason)
-    folder = Path(tempfile.mkdtemp(prefix="sgsst-c-", dir="/tmp"))
-    try:
-        figures = measure(folder, arguments.kinds, arguments.faults, arguments.seconds, arguments.seed)
-    finally:
-        if arguments.logs:
-            arguments.logs.mkdir(parents=True, exist_ok=True)
-            for path in folder.glob("net/*.log"):
-                shutil.copy(path, arguments.logs)
-        shutil.rmtree(folder, ignore_errors=True)
-    path = write_result("cluster_faults", {"seed": arguments.seed, **figures})
-    print(json.dumps({name: value for name, value in figures.items() if name != "each"}, indent=2))
-    print(path)
-    sys.exit(1 if figures["lost"] or figures["published_twice"] or figures["different"] else 0)
+    with tempfile.TemporaryDirectory(prefix="sgsst-c-", dir="/tmp", ignore_cleanup_errors=True) as folder:
+        figures = measure(Path(folder), [*KINDS], FAULTS)
+    print(json.dumps(figures, indent=2))
+    print(write_result("cluster_faults", figures))
+    sys.exit(bool(figures["lost"] or figures["published_twice"] or figures["different"]))
 
 
-def measure(
-    folder: Path, kinds: Sequence[str], faults: int, seconds: float | None = None, seed: int = 0
-) -> dict[str, Any]:
+def measure(folder: Path, kinds: Sequence[str], faults: int) -> dict[str, Any]:
     """Run the cluster under faults and return all figures.
 
     Args:
         folder: Working folder. Its path must be short.
         kinds: Kinds of faults.
         faults: Number of faults.
-        seconds: Time after which no further fault starts; None for no limit.
-        seed: Seed of the random choices.
     """
     folder.chmod(0o755)
-    for name in ("inputs", "weights", "net"):
+    for name in ("inputs", "weights", "net", *map(str, SEEDS)):
         (folder / name).mkdir()
     install_tiny_weights(folder / "weights")
     ply, cameras, style = write_files(folder / "inputs", wall())
     files = {"scene": ply, "cameras": cameras, "style": style}
-    expected = _expected(folder, files)
+    with mock.patch.dict(os.environ, SGSST_CACHE=str(folder / "weights")):  # the cluster's network weights
+        expected = {seed: undisturbed(files, {**PARAMETERS, "seed": seed}, folder / str(seed)) for seed in SEEDS}
     with Network(folder / "net") as network:
         cluster = Cluster(network, folder / "weights")
         cluster.start()
-        run = Run(cluster.urls, files, PARAMETERS, cluster=cluster, chance=random.Random(seed))
+        run = Run(cluster.urls, files, PARAMETERS, cluster=cluster, chance=random.Random(0))
         reader = threading.Thread(target=run.watch_reads)
         reader.start()
         try:
-            attacked = attack(run, kinds, faults, seconds)
+            attacked = attack(run, kinds, faults)
             jobs = run.wait_for_all()
         finally:
             run.over.set()
@@ -420,32 +387,16 @@ def measure(
         return {"attacked_seconds": round(attacked, 1), **_count(run, jobs, expected, folder), **_left(run, jobs)}
 
 
-def attack(run: Run, kinds: Sequence[str], faults: int, limit: float | None) -> float:
+def attack(run: Run, kinds: Sequence[str], faults: int) -> float:
     """Inject faults in rounds, each with all kinds in random order, and return the elapsed seconds."""
     started = time.monotonic()
     order: list[str] = []
-    while len(run.faults) < faults and (limit is None or time.monotonic() - started < limit):
+    while len(run.faults) < faults:
         if not order:
             order = list(kinds)
             run.chance.shuffle(order)
         run.strike(order.pop())
     return time.monotonic() - started
-
-
-def _expected(folder: Path, files: dict[str, Path]) -> dict[int, Path]:
-    """Return the results of `sgsst stylize` on one rank by seed, computed with the cluster's network weights."""
-    installed = os.environ.get("SGSST_CACHE")
-    os.environ["SGSST_CACHE"] = str(folder / "weights")
-    try:
-        paths = {}
-        for seed in SEEDS:
-            (folder / f"expected_{seed}").mkdir()
-            paths[seed] = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{seed}")
-        return paths
-    finally:
-        os.environ.pop("SGSST_CACHE")
-        if installed is not None:
-            os.environ["SGSST_CACHE"] = installed
 
 
 def _count(run: Run, jobs: dict[str, dict[str, Any]], expected: dict[int, Path], folder: Path) -> dict[str, Any]:
@@ -458,7 +409,9 @@ def _count(run: Run, jobs: dict[str, dict[str, Any]], expected: dict[int, Path],
             distance = run.distance(job_id, wanted, folder)
             farthest = max(farthest, distance)
             different += ranks == 1 or distance > 0.05
-    kinds = sorted({record["kind"] for record in run.faults})
+    steps: dict[str, list[float | None]] = {}
+    for record in run.faults:
+        steps.setdefault(record["kind"], []).append(record["until_steps_after_mending"])
     return {
         "faults": len(run.faults),
         "jobs_accepted": len(run.accepted),
@@ -467,24 +420,13 @@ def _count(run: Run, jobs: dict[str, dict[str, Any]], expected: dict[int, Path],
         "published_twice": sum(run.published(job_id) != 1 for job_id in ended),
         "different": different,
         "farthest_of_two_ranks": farthest,
-        "most_attempts_of_a_job": max((len(job["attempts"]) for job in jobs.values()), default=0),
         "reads_unanswered": len(run.unanswered),
         "longest_unanswered_seconds": round(max(run.unanswered, default=0.0), 1),
         "seconds_until_steps_after_mending": {
-            kind: _spread([record["until_steps_after_mending"] for record in run.faults if record["kind"] == kind])
-            for kind in kinds
+            kind: {"never": each.count(None), **spread([value for value in each if value is not None])}
+            for kind, each in sorted(steps.items())
         },
         "each": run.faults,
-    }
-
-
-def _spread(values: list[float | None]) -> dict[str, float | int | None]:
-    known = [value for value in values if value is not None]
-    return {
-        "faults": len(values),
-        "never": len(values) - len(known),
-        "median": round(statistics.median(known), 1) if known else None,
-        "largest": max(known, default=None),
     }
 
 
@@ -545,6 +487,8 @@ def missing() -> str | None:
     for tool in _TOOLS:
         if shutil.which(tool) is None:
             return f"{tool} is missing: apt-get install -y iproute2 util-linux mount"
+    if programs_folder() is None:
+        return "initdb is missing: apt-get install -y postgresql"
     return None if Path("/dev/net/tun").exists() else "/dev/net/tun is missing"
 
 
@@ -720,11 +664,6 @@ class Host:
         self._descriptors: tuple[int, ...] = ()
         self._first: subprocess.Popen[bytes] | None = None
         self._services: list[subprocess.Popen[bytes]] = []
-
-    @property
-    def runs(self) -> bool:
-        """Whether the host is running."""
-        return self._first is not None
 
     def start(self) -> None:
         """Start the host, with an empty disk and no services."""

@@ -1,6 +1,6 @@
 """Latency of one API key's small submissions while another key attacks the service.
 
-python -m benchmarks.hostile_key [--parallel 16] [--seconds 60] [--result NAME]
+python -m benchmarks.hostile_key
 
 One key sends costly requests, 16 at a time: files that are slow to validate, dry runs, large bodies that are refused,
 and uploads that are created and deleted. Meanwhile, another key submits small jobs one after the other, each with files
@@ -13,7 +13,6 @@ import argparse
 import asyncio
 import itertools
 import json
-import math
 import multiprocessing
 import tempfile
 import time
@@ -28,7 +27,7 @@ from benchmarks.common import parse, write_result
 from benchmarks.service_load import spread
 from service.settings import ServiceSettings
 from service.store import open_store
-from sgsst_core.files.scene_file import write_scene
+from tests.api.http.sending import TUS
 from tests.api.service import Service
 from tests.small_scenes import cameras, wall, write_files
 
@@ -37,10 +36,12 @@ _SETTINGS = {
     "SGSST_MAX_JOBS_PER_KEY": "1000000",
     "SGSST_MIN_FREE_BYTES": "1000000000",
 }
-_TUS = {"Tus-Resumable": "1.0.0"}
+_ROLES = ("scene", "cameras", "style")
 _QUICK = {"preset": "preview", "backbone": "vgg16", "resolution": 128}
 #: Bytes of a request body that is refused only after its last byte.
 _LARGE = 60_000_000
+#: Number of simultaneous costly requests, and seconds of small ones beside each kind of them.
+_PARALLEL, _SECONDS = 16, 60.0
 #: Timeout in seconds for responses to the hostile key, and for responses to the other key.
 _PATIENCE, _SHORT_PATIENCE = 600.0, 60.0
 
@@ -48,28 +49,17 @@ Files = dict[str, bytes]
 Costly = Callable[[httpx2.AsyncClient, Files, int], Awaitable[httpx2.Response]]
 
 
-def costly_files(folder: Path) -> Files:
-    """Write a scene with 2,000 cameras that all look away from it, so that validation has to try each camera."""
-    scene = wall(500, 400)
-    scene.means[:, 2] = -3
-    write_scene(folder / "behind.ply", scene)
-    views = [{**view, "id": number, "img_name": f"v{number}"} for number, view in enumerate(_views(2000))]
-    return {"scene": (folder / "behind.ply").read_bytes(), "cameras": json.dumps(views).encode()}
+def input_files(folder: Path) -> Files:
+    """Return the contents of small files, and of a scene with 2,000 cameras that all look away from it.
 
-
-def _views(count: int) -> list[dict[str, Any]]:
-    return [
-        {
-            "width": camera.width,
-            "height": camera.height,
-            "position": [0.1 * math.sin(number), 0, 0],
-            "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-            "fx": camera.width,
-            "fy": camera.width,
-        }
-        for number in range(count)
-        for camera in cameras(1)
-    ]
+    Validation has to try each of these cameras.
+    """
+    (folder / "inputs").mkdir()
+    behind = wall(500, 400)
+    behind.means[:, 2] = -3
+    small, costly = write_files(folder / "inputs", wall()), write_files(folder, behind, cameras(2000))
+    names = [*_ROLES, *(f"costly {role}" for role in _ROLES)]
+    return {name: path.read_bytes() for name, path in zip(names, small + costly, strict=True)}
 
 
 def form(files: Files, number: int) -> dict[str, Any]:
@@ -81,12 +71,11 @@ def form(files: Files, number: int) -> dict[str, Any]:
 
 
 async def _inspection(client: httpx2.AsyncClient, files: Files, number: int) -> httpx2.Response:
-    costly = {**files, "scene": files["costly scene"], "cameras": files["costly cameras"]}
-    return await client.post("/v1/jobs", **form({role: costly[role] for role in ("scene", "cameras", "style")}, number))
+    return await client.post("/v1/jobs", **form({role: files[f"costly {role}"] for role in _ROLES}, number))
 
 
 async def _dry_run(client: httpx2.AsyncClient, files: Files, number: int) -> httpx2.Response:
-    request = form({role: files[role] for role in ("scene", "cameras", "style")}, number)
+    request = form({role: files[role] for role in _ROLES}, number)
     return await client.post("/v1/jobs", params={"dry_run": True}, **request | {"data": {}})
 
 
@@ -96,7 +85,7 @@ async def _large_body(client: httpx2.AsyncClient, files: Files, number: int) -> 
 
 
 async def _uploads(client: httpx2.AsyncClient, files: Files, number: int) -> httpx2.Response:
-    answer = await client.post("/v1/uploads", headers=_TUS | {"Upload-Length": "1000"})
+    answer = await client.post("/v1/uploads", headers=TUS | {"Upload-Length": "1000"})
     if answer.status_code == 201:
         await client.delete(answer.headers["location"])
     return answer
@@ -110,7 +99,7 @@ ATTACKS: dict[str, Costly] = {
 }
 
 
-def attack(url: str, key: str, name: str, files: Files, parallel: int, statuses: Any) -> None:
+def attack(url: str, key: str, name: str, files: Files, statuses: Any) -> None:
     """Send requests of one kind until the process is killed, and count response statuses."""
 
     async def one(client: httpx2.AsyncClient, numbers: itertools.count[int]) -> None:
@@ -123,10 +112,10 @@ def attack(url: str, key: str, name: str, files: Files, parallel: int, statuses:
 
     async def all_of_them() -> None:
         numbers = itertools.count(int(time.time() * 1000) << 20)
-        limits = httpx2.Limits(max_connections=parallel)
+        limits = httpx2.Limits(max_connections=_PARALLEL)
         headers = {"Authorization": f"Bearer {key}"}
         async with httpx2.AsyncClient(base_url=url, headers=headers, timeout=_PATIENCE, limits=limits) as client:
-            await asyncio.gather(*(one(client, numbers) for _ in range(parallel)))
+            await asyncio.gather(*(one(client, numbers) for _ in range(_PARALLEL)))
 
     asyncio.run(all_of_them())
 
@@ -135,7 +124,7 @@ def submissions(url: str, key: str, files: Files, seconds: float) -> dict[str, A
     """Submit small jobs one after the other, and return the time until each one was accepted."""
     took: list[float] = []
     statuses: Counter[str] = Counter()
-    small = {role: files[role] for role in ("scene", "cameras", "style")}
+    small = {role: files[role] for role in _ROLES}
     first = int(time.time() * 1000) << 20
     end = time.perf_counter() + seconds
     with httpx2.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=_SHORT_PATIENCE) as client:
@@ -150,29 +139,26 @@ def submissions(url: str, key: str, files: Files, seconds: float) -> dict[str, A
     return {"statuses": dict(statuses), "submissions": len(took), "most_ms": round(1000 * max(took), 1), **spread(took)}
 
 
-def measure(folder: Path, parallel: int, seconds: float) -> dict[str, Any]:
+def measure(folder: Path) -> dict[str, Any]:
     """Return percentiles of the small submissions' times, without an attack and during each kind of attack."""
-    (folder / "inputs").mkdir()
-    ply, views, style = write_files(folder / "inputs", wall())
-    files = {"scene": ply.read_bytes(), "cameras": views.read_bytes(), "style": style.read_bytes()}
-    files |= {f"costly {role}": content for role, content in costly_files(folder).items()}
+    files = input_files(folder)
     figures: dict[str, Any] = {}
     with Service(folder / "data", alone=True, **_SETTINGS) as service:
         store = open_store(ServiceSettings(data=service.data))
         hostile, other = (store.keys.create(name)[1] for name in ("hostile", "other"))
         store.close()
         submissions(service.url, other, files, 1)  # warm-up: modules and data that are loaded once
-        figures["alone"] = submissions(service.url, other, files, seconds / 4)
+        figures["alone"] = submissions(service.url, other, files, _SECONDS / 4)
         print("alone", figures["alone"], flush=True)
         context = multiprocessing.get_context("spawn")
         with context.Manager() as manager:
             for name in ATTACKS:
                 statuses = manager.dict()
-                arguments = (service.url, hostile, name, files, parallel, statuses)
+                arguments = (service.url, hostile, name, files, statuses)
                 process = context.Process(target=attack, args=arguments, daemon=True)
                 process.start()
                 time.sleep(10)  # until the attack's requests queue up
-                figures[name] = submissions(service.url, other, files, seconds)
+                figures[name] = submissions(service.url, other, files, _SECONDS)
                 process.kill()
                 process.join()
                 figures[name]["hostile_answers"] = dict(statuses)
@@ -182,13 +168,10 @@ def measure(folder: Path, parallel: int, seconds: float) -> dict[str, Any]:
 
 def main() -> None:
     """Measure, then print and store the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parallel", type=int, default=16)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    arguments = parse(parser)
+    parse(argparse.ArgumentParser(description=__doc__))
     with tempfile.TemporaryDirectory(prefix="sgsst-hostile-") as folder:
-        figures = measure(Path(folder), arguments.parallel, arguments.seconds)
-    print(write_result("hostile_key", {"parallel": arguments.parallel, **figures}))
+        figures = measure(Path(folder))
+    print(write_result("hostile_key", {"parallel": _PARALLEL, **figures}))
 
 
 if __name__ == "__main__":

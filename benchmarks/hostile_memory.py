@@ -1,6 +1,6 @@
 """Peak memory growth of the API during each of several attacks with hostile requests.
 
-    python -m benchmarks.hostile_memory [--attacks trailers sign_in ...] [--name hostile_memory]
+    python -m benchmarks.hostile_memory
 
 Each attack runs against a separate API process on loopback, which requires no key. Growth is the difference between the
 peak that the kernel reports (`VmHWM`) and the memory after a few ordinary requests. An attack is stopped once the API
@@ -162,13 +162,10 @@ def kept_alive(target: Target) -> None:
     _held(target, b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n")
 
 
-ATTACKS: dict[str, Callable[[Target], None]] = {
-    attack.__name__: attack
-    for attack in (trailers, sign_in, json_text, json_lists, unfinished, pipelined, idle, kept_alive)
-}
+ATTACKS = (trailers, sign_in, json_text, json_lists, unfinished, pipelined, idle, kept_alive)
 
 
-def measure(name: str) -> dict[str, Any]:
+def measure(attack: Callable[[Target], None]) -> dict[str, Any]:
     """Run one attack against a new API process."""
     with (
         tempfile.TemporaryDirectory(prefix="sgsst-hostile-") as folder,
@@ -180,7 +177,7 @@ def measure(name: str) -> dict[str, Any]:
             client.post("/v1/jobs", json={"scene": "x", "style": "x"})
         target = Target(service)
         started = time.perf_counter()
-        ATTACKS[name](target)
+        attack(target)
         seconds = time.perf_counter() - started
         growth = target.growth()
         wait_for(service.ready, "the service to answer afterwards", service.said)
@@ -190,16 +187,12 @@ def measure(name: str) -> dict[str, Any]:
 
 def main() -> None:
     """Run the attacks, then print and store the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--attacks", nargs="+", choices=ATTACKS, default=list(ATTACKS))
-    parser.add_argument("--name", default="hostile_memory", help="name of the result file")
-    arguments = parse(parser)
+    parse(argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter))
     results = {}
-    print(f"{'attack':<12} {'growth':>9} {'time':>8}  answers")
-    for name in arguments.attacks:
-        results[name] = figures = measure(name)
-        print(f"{name:<12} {figures['growth_mb']:>6} MB {figures['seconds']:>6} s  {figures['answers']}", flush=True)
-    print(write_result(arguments.name, {"allowed_mb": ALLOWED / MB, "attacks": results}))
+    for attack in ATTACKS:
+        results[attack.__name__] = measure(attack)
+        print(attack.__name__, results[attack.__name__], flush=True)
+    print(write_result("hostile_memory", {"allowed_mb": ALLOWED / MB, "attacks": results}))
 
 
 if __name__ == "__main__":

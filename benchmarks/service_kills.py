@@ -1,6 +1,6 @@
 """Random SIGKILLs of the service's processes while it runs a queue of small jobs.
 
-python -m benchmarks.service_kills [--kills 100] [--rank-kills 6] [--seed 0]
+python -m benchmarks.service_kills
 
 `sgsst serve` runs with default settings except for `SETTINGS`. The benchmark counts accepted jobs that do not succeed
 (lost), results that are announced or stored twice (published twice), and PLY files that are not bit-identical to that
@@ -57,8 +57,8 @@ EVERY = {API: 9.0, DISPATCHER: 30.0, ATTEMPT: 30.0, EVERYTHING: 120.0}
 FINISHED = ("succeeded", "failed", "canceled", "expired")
 #: Seconds until a request that nothing answers, or a job that does not end, counts as lost.
 PATIENCE = 900.0
-#: Number of unfinished jobs to maintain.
-_QUEUE = 2
+#: Number of unfinished jobs to maintain, of kills at random, and of kills of a rank.
+_QUEUE, _KILLS, _RANK_KILLS = 2, 100, 6
 
 
 @dataclass
@@ -70,14 +70,12 @@ class Attacked:
         files: Input files of all jobs by role.
         parameters: Parameters of all jobs.
         accepted: Parameters in which each accepted job differs from the others, by job id.
-        resent: Number of requests that were sent again.
     """
 
     urls: list[str]
     files: dict[str, Path]
     parameters: dict[str, Any]
     accepted: dict[str, dict[str, Any]] = field(default_factory=dict)
-    resent: int = 0
 
     def call(self, method: str, path: str, **options: Any) -> httpx2.Response:
         """Send a request to any API process that responds; retry while none does.
@@ -92,7 +90,6 @@ class Attacked:
                     answer = httpx2.request(method, f"{url}{path}", timeout=15, trust_env=False, **options)
                     if answer.status_code < 500:
                         return answer
-                self.resent += 1
             time.sleep(0.05)
         raise RuntimeError(f"{method} {path} was never answered")
 
@@ -163,7 +160,6 @@ class Run(Attacked):
     kills: Counter[str] = field(default_factory=Counter)
     api_back: list[float] = field(default_factory=list)
     running_again: list[float] = field(default_factory=list)
-    everything_back: list[float] = field(default_factory=list)
 
     def active(self) -> dict[str, Any] | None:
         """Return the job in progress, or None."""
@@ -177,10 +173,8 @@ class Run(Attacked):
     def strike(self, target: str, chance: random.Random) -> None:
         """Kill one process, and measure the recovery."""
         if target == EVERYTHING:
-            started = time.monotonic()
             self.service.stop(signal.SIGKILL)
             self.service.start()
-            self.everything_back.append(time.monotonic() - started)
         else:
             before = self.active() if target == DISPATCHER else None
             if not self.kill(target, chance):
@@ -217,10 +211,10 @@ class Run(Attacked):
         return False
 
 
-def attack(run: Run, kills: int, chance: random.Random) -> None:
-    """Kill processes at random moments until the given number of kills is reached."""
+def attack(run: Run, chance: random.Random) -> None:
+    """Kill processes at random moments."""
     due = {target: time.monotonic() + chance.expovariate(1 / mean) for target, mean in EVERY.items()}
-    while sum(run.kills.values()) < kills:
+    while sum(run.kills.values()) < _KILLS:
         run.fill()
         target = min(due, key=lambda name: due[name])
         time.sleep(max(0.0, due[target] - time.monotonic()))
@@ -231,13 +225,11 @@ def attack(run: Run, kills: int, chance: random.Random) -> None:
             print(f"{done} kills, {len(run.accepted)} jobs accepted", flush=True)
 
 
-def attack_ranks(run: Run, kills: int, chance: random.Random) -> str | None:
+def attack_ranks(run: Run, chance: random.Random) -> str:
     """Run a job on two ranks, kill one of them repeatedly, and return the job's id."""
-    if not kills:
-        return None
     job_id = run.submit(seed=SEEDS[0], workers=2, steps_sos=RANK_STEPS)
     reached = 0
-    while run.kills[RANK] < kills:
+    while run.kills[RANK] < _RANK_KILLS:
         job = run.call("GET", f"/v1/jobs/{job_id}").json()
         if job["status"] in FINISHED:
             break
@@ -259,75 +251,53 @@ def published(run: Run, job_id: str) -> int:
 
 def spread(values: list[float]) -> dict[str, float | int | None]:
     """Return count, median and maximum."""
-    ordered = sorted(values)
     return {
-        "measured": len(ordered),
-        "median": round(statistics.median(ordered), 2) if ordered else None,
-        "largest": round(ordered[-1], 2) if ordered else None,
+        "measured": len(values),
+        "median": round(statistics.median(values), 2) if values else None,
+        "largest": round(max(values), 2) if values else None,
     }
 
 
 def main() -> None:
     """Run the benchmark, then print and store the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--rank-kills", type=int, default=6)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parse(parser)
-    chance = random.Random(arguments.seed)
+    parse(argparse.ArgumentParser(description=__doc__))
     with tempfile.TemporaryDirectory(prefix="sgsst-kills-") as name:
-        folder = Path(name)
-        figures = measure(folder, arguments.kills, arguments.rank_kills, chance)
-    path = write_result("service_kills", {"seed": arguments.seed, **figures})
+        figures = measure(Path(name), random.Random(0))
     print(json.dumps(figures, indent=2))
-    print(path)
-    sys.exit(1 if figures["lost"] or figures["published_twice"] or figures["different"] else 0)
+    print(write_result("service_kills", figures))
+    sys.exit(bool(figures["lost"] or figures["published_twice"] or figures["different"]))
 
 
-def measure(folder: Path, kills: int, rank_kills: int, chance: random.Random) -> dict[str, Any]:
+def measure(folder: Path, chance: random.Random) -> dict[str, Any]:
     """Run the service while killing its processes, and return all figures."""
-    (folder / "inputs").mkdir()
+    for part in ("inputs", "long", *map(str, SEEDS)):
+        (folder / part).mkdir()
     ply, cameras, style = write_files(folder / "inputs", wall())
     files = {"scene": ply, "cameras": cameras, "style": style}
-    expected = {}
-    for number, seed in enumerate(SEEDS):
-        (folder / f"expected_{number}").mkdir()
-        undisturbed_run = undisturbed(files, {**PARAMETERS, "seed": seed}, folder / f"expected_{number}")
-        expected[seed] = undisturbed_run.read_bytes()
-    (folder / "long").mkdir()
-    long = {**PARAMETERS, "seed": SEEDS[0], "steps_sos": RANK_STEPS}
-    one_rank = undisturbed(files, long, folder / "long") if rank_kills else None
+    expected = {seed: undisturbed(files, {**PARAMETERS, "seed": seed}, folder / str(seed)) for seed in SEEDS}
+    one_rank = undisturbed(files, {**PARAMETERS, "seed": SEEDS[0], "steps_sos": RANK_STEPS}, folder / "long")
     started = time.monotonic()
     with Service(folder / "data", **SETTINGS) as service:
         run = Run([service.url], files, PARAMETERS, service=service)
-        attack(run, kills, chance)
+        attack(run, chance)
         attacked = time.monotonic() - started
-        on_ranks = attack_ranks(run, rank_kills, chance)
+        on_ranks = attack_ranks(run, chance)
         jobs = run.wait_for_all()
         ended = [job_id for job_id in run.accepted if jobs.get(job_id, {}).get("status") == "succeeded"]
-        known = {job["id"] for job in run.jobs()}
-        attempts = Counter(each["outcome"] for job in jobs.values() for each in job["attempts"])
-        alike = [job_id for job_id in ended if job_id != on_ranks]
-        figures: dict[str, Any] = {
+        alike = {job_id: expected[run.accepted[job_id]["seed"]] for job_id in ended if job_id != on_ranks}
+        return {
             "kills": dict(run.kills),
             "kills_in_all": sum(run.kills.values()),
             "seconds": round(attacked, 1),
             "jobs_accepted": len(run.accepted),
             "lost": len(run.accepted) - len(ended),
-            "created_twice": len(known - set(run.accepted)),
             "published_twice": sum(published(run, job_id) != 1 for job_id in ended),
-            "different": sum(run.result(job_id) != expected[run.accepted[job_id]["seed"]] for job_id in alike),
-            "attempts": dict(attempts),
-            "most_attempts_of_a_job": max(len(job["attempts"]) for job in jobs.values()),
-            "requests_sent_again": run.resent,
+            "different": sum(run.result(job_id) != path.read_bytes() for job_id, path in alike.items()),
             "seconds_until_the_api_answers": spread(run.api_back),
             "seconds_until_a_job_runs_again_after_a_dispatchers_death": spread(run.running_again),
-            "seconds_until_everything_is_ready_again": spread(run.everything_back),
             "not_succeeded": [job.get("error") for job in jobs.values() if job["status"] != "succeeded"],
+            "two_ranks_from_one": run.distance(on_ranks, one_rank, folder) if on_ranks in ended else None,
         }
-        if one_rank is not None and on_ranks in ended:
-            figures["two_ranks_from_one"] = run.distance(on_ranks, one_rank, folder)
-        return figures
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from tests.ports import free_port
 
 def is_installed() -> bool:
     """Return whether the programs of PostgreSQL are installed."""
-    return _programs() is not None
+    return programs_folder() is not None
 
 
 class Postgres:
@@ -30,7 +30,7 @@ class Postgres:
     """
 
     def __init__(self, *, durable: bool) -> None:
-        programs = _programs()
+        programs = programs_folder()
         assert programs is not None
         self._programs = programs
         self._folder = Path(tempfile.mkdtemp(prefix="sgsst-pg-"))
@@ -112,7 +112,8 @@ def fresh_database(url: str, template: str = "template1") -> str:
     return f"{url}/{name}"
 
 
-def _programs() -> Path | None:
+def programs_folder() -> Path | None:
+    """Return the folder of PostgreSQL's programs, or None if it is not installed."""
     programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/pg_ctl"))
     on_path = shutil.which("pg_ctl")
     place = programs[-1] if programs else Path(on_path).resolve() if on_path else None
