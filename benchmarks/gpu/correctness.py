@@ -34,12 +34,8 @@ from sgsst_core.bench.device_checks import (
     views,
 )
 from sgsst_core.features.vgg import FeatureNetwork, has_bfloat16
-from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.scene_file import read_scene
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.rasterizer import drawing_problem, make_rasterizer
-from sgsst_core.scene.camera import Camera, resized, spread
-from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests import triton_interpreter
@@ -56,7 +52,6 @@ GRADIENT_BOUND = 1e-4
 #: Bound on the relative error of the change in color. It is larger, because Adam normalizes gradients, so a color whose
 #: gradient is only rounding error moves as far as any other.
 COLORS_BOUND = 1e-2
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 #: Bound on the relative difference from the CPU's loss, for means over rounds of all views. Single losses differ more:
 #: Adam normalizes gradients, so a color whose gradient is only rounding error moves as far as any other.
 CURVE_BOUND = 1e-3
@@ -175,13 +170,12 @@ def curve(sizes: Sizes, findings: Findings) -> None:
         command = [sys.executable, "-m", "benchmarks.gpu.correctness", str(path), *(["--quick"] if quick else [])]
         other = subprocess.Popen(command, env={**os.environ, "CUDA_VISIBLE_DEVICES": ""})
         try:
-            scene, losses = follow_curve(sizes, None if torch.cuda.is_available() else "triton")
+            losses = follow_curve(sizes, None if torch.cuda.is_available() else "triton")
             if other.wait() != 0:
                 raise RuntimeError(f"the CPU's run ended with status {other.returncode}")
         finally:
             other.kill()
         expected = json.loads(path.read_text())
-    findings.add("scene", scene)
     findings.add("losses", losses)
     findings.add("losses_on_the_cpu", expected)
     findings.add("largest_difference_of_a_step", largest_difference(losses, expected, 1))
@@ -195,35 +189,25 @@ def largest_difference(losses: list[float], expected: list[float], window: int) 
     return max(abs(sum(differences[start : start + window])) / window for start in starts)
 
 
-def follow_curve(sizes: Sizes, rasterizer: str | None) -> tuple[str, list[float]]:
-    """Run the job, and return the scene's name and the loss of each step."""
+def follow_curve(sizes: Sizes, rasterizer: str | None) -> list[float]:
+    """Run a job on a ball and cameras whose views it fills, and return the loss of each step."""
     steps, side = sizes.curve
-    name, scene, cameras = curve_inputs(side, small=sizes == QUICK)
+    quick = sizes == QUICK
+    ball, cameras = surface_scene(60 if quick else 20_000, degree=1), views(1 if quick else VIEWS, side, side * 3 // 4)
     settings = make_settings(
         "standard", steps_coarse=steps // 2, steps_sos=steps - steps // 2, learning_rate=LEARNING_RATE,
         scale_sampling=1, early_stop=False, cached_weights="none", coarsest_side=side // 2,
     )  # fmt: skip
     weights = network_weights(sizes)
     style = texture(side, side, seed=3)
-    stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, rasterizer=rasterizer)
-    return name, [stylizer.run_step().loss for _ in range(stylizer.job.total_steps)]
-
-
-def curve_inputs(side: int, *, small: bool) -> tuple[str, Scene, list[Camera]]:
-    """Return a real scene with cameras if it is present, otherwise a ball and cameras whose views it fills."""
-    folder = DATA / "scenes" / "snowmiku_plush"
-    if not small and (folder / "cameras.json").is_file():
-        cameras = spread(read_cameras(folder / "cameras.json"), VIEWS)
-        scene = read_scene(folder / "point_cloud.ply").scene
-        return folder.name, scene, [resized(camera, side) for camera in cameras]
-    ball = surface_scene(60 if small else 20_000, degree=1)
-    return "synthetic", ball, views(1 if small else VIEWS, side, side * 3 // 4)
+    stylizer = Stylizer.planned(ball, cameras, style, settings, weights=weights, rasterizer=rasterizer)
+    return [stylizer.run_step().loss for _ in range(stylizer.job.total_steps)]
 
 
 def main(arguments: list[str]) -> None:
     """Run the job on the CPU, and write the losses to the file named by the first argument."""
     sizes = QUICK if "--quick" in arguments else Sizes()
-    Path(arguments[0]).write_text(json.dumps(follow_curve(sizes, "cpu")[1]))
+    Path(arguments[0]).write_text(json.dumps(follow_curve(sizes, "cpu")))
 
 
 if __name__ == "__main__":

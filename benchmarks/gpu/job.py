@@ -12,16 +12,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-import safetensors.torch
 import torch
 from PIL import Image
 
 from benchmarks.gpu.part import QUICK, Findings, Sizes
 from benchmarks.gpu.speed import ZOOM
 from sgsst_core.bench.device_checks import random_weights, surface_scene, texture, views
-from sgsst_core.features.weight_files import digest_of_bytes, weights_file
-from sgsst_core.files.library import save
-from sgsst_core.scene.camera import Camera
+from sgsst_core.features.network_weights import fetch_network_weights
+from tests.small_scenes import write_files
 
 #: Seconds after which a job is asked to stop, as by Ctrl-C.
 _PATIENCE = 150
@@ -35,9 +33,7 @@ def job(sizes: Sizes, findings: Findings) -> None:
         folder = Path(temporary)
         _install_weights(folder)
         for count, width, height, gaussians in sizes.jobs:
-            save(folder / "scene.ply", surface_scene(gaussians, degree=3))
-            cameras = views(count, width, height, ZOOM)
-            (folder / "cameras.json").write_text(json.dumps([_entry(camera) for camera in cameras]))
+            write_files(folder, surface_scene(gaussians, degree=3), views(count, width, height, ZOOM))
             image = (255 * texture(height, height, seed=3)).byte().numpy()
             Image.fromarray(image).save(folder / "style.png")
             options = ["--steps-sos", "2"] if sizes == QUICK else []
@@ -49,25 +45,13 @@ def job(sizes: Sizes, findings: Findings) -> None:
 
 def _install_weights(folder: Path) -> None:
     """Install random weights of VGG19, which take the time of trained ones, in a folder for `SGSST_CACHE`."""
-    weights = random_weights()
     tensors = {
-        f"{name}.{kind}": tensor.contiguous()
-        for name, pair in weights.convolutions.items()
+        f"{name}.{kind}": tensor
+        for name, pair in random_weights().convolutions.items()
         for kind, tensor in zip(("weight", "bias"), pair, strict=True)
     }
-    tensors |= {"input_scale": weights.input_scale, "input_shift": weights.input_shift}
-    metadata = {"name": "vgg19", "source": "random", "source_sha256": ""}
-    metadata["sha256"] = digest_of_bytes(safetensors.torch.save(tensors, metadata))
-    weights_file(folder, "vgg19").write_bytes(safetensors.torch.save(tensors, metadata))
-
-
-def _entry(camera: Camera) -> dict[str, Any]:
-    """Return a camera as an entry of an INRIA cameras.json."""
-    pose = torch.linalg.inv(camera.world_to_camera.double())
-    return {
-        "img_name": camera.name, "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
-        "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist(),
-    }  # fmt: skip
+    torch.save(tensors, folder / "random.pth")
+    fetch_network_weights("vgg19", source=folder / "random.pth", folder=folder)
 
 
 def _run(folder: Path, options: list[str]) -> dict[str, Any]:

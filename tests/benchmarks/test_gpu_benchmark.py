@@ -53,14 +53,12 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     assert whole["plan"]["prediction"]["seconds"] > 0
     for count in ("60", "120"):
         entry = findings["raster"][count]
-        assert PASSES | {"survey_seconds_a_view", "lists_seconds", "lists_bytes", "pairs"} <= set(entry)
-        assert PASSES | {"first_render_seconds", "bytes"} <= set(entry["cached_weights"])
-        assert entry["spherical_harmonics"]["seconds"] > 0
+        assert PASSES | {"lists_seconds", "cached_weights"} == set(entry)
+        assert set(entry["cached_weights"]) == PASSES
     entry = findings["step"]["32x32"]["float32"]
     assert entry["seconds_in_loop"] > 0
     assert entry["rasterizer"] == "triton"
     assert {"vgg_forward", "vgg_backward", "render", "raster_backward"} <= set(entry["seconds_by_part"])
-    assert entry["planned_process_bytes"] > 0
     assert entry["planned_device_bytes"] is None
     assert len(findings["curve"]["losses"]) == len(findings["curve"]["losses_on_the_cpu"]) == 2
     assert findings["curve"]["loss"]["passed"]
