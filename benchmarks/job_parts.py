@@ -1,6 +1,6 @@
 """Seconds of whole commands by part: from the command to the first step, in the steps, and to the last file.
 
-python -m benchmarks.job_parts SCENE.ply CAMERAS STYLE [--millions 0.05 4] [--views 24] [--rounds 3] [-- OPTIONS]
+python -m benchmarks.job_parts SCENE.ply CAMERAS STYLE [-- OPTIONS]
 
 Scenes of millions of Gaussians are copies of the given one (`large_scene.multiplied`). Each command is a process of its
 own. What its report does not name is the process's own start and end, in `unnamed`. Medians are stored.
@@ -24,6 +24,8 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 SGSST = [sys.executable, "-m", "api.cli"]
 #: Commands that only start the program.
 STARTS = ("--version", "--help")
+#: Millions of Gaussians, number of views, and number of runs.
+MILLIONS, VIEWS, ROUNDS = (0.05, 4), "24", 3
 
 
 def main() -> None:
@@ -32,27 +34,24 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("cameras")
     parser.add_argument("style")
-    parser.add_argument("--millions", type=float, nargs="+", default=[0.05, 4])
-    parser.add_argument("--views", default="24")
-    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("options", nargs="*", help="of `sgsst stylize`, after --")
     arguments = parse(parser)
     scene = read_scene(arguments.scene).scene
-    starts = {name: median(command_seconds([name]) for _ in range(arguments.rounds)) for name in STARTS}
+    starts = {name: median(command_seconds([name]) for _ in range(ROUNDS)) for name in STARTS}
     jobs = {}
     with tempfile.TemporaryDirectory() as folder:
         ply, out = Path(folder, "scene.ply"), Path(folder, "out.ply")
-        for millions in arguments.millions:
+        for millions in MILLIONS:
             write_scene(ply, multiplied(scene, round(millions * 1e6)))
-            views = ["--cameras", arguments.cameras, "--views", arguments.views]
+            views = ["--cameras", arguments.cameras, "--views", VIEWS]
             job = ["stylize", str(ply), *views, "--style", arguments.style, "--out", str(out), *arguments.options]
-            jobs[f"{millions:g} million"] = _job(job, out.with_suffix(".report.json"), arguments.rounds)
+            jobs[f"{millions:g} million"] = _job(job, out.with_suffix(".report.json"))
     for name, parts in {"starts": starts, **jobs}.items():
         total = parts.get("command", 1.0)
         print(
             name, *(f"  {part:<16}{seconds:8.2f} s {seconds / total:6.1%}" for part, seconds in parts.items()), sep="\n"
         )
-    figures = {"views": arguments.views, "options": arguments.options, "starts": starts, "jobs": jobs}
+    figures = {"views": VIEWS, "options": arguments.options, "starts": starts, "jobs": jobs}
     write_result("job_parts", figures, presets=["standard"], scenes={arguments.scene.parent.name: arguments.scene})
 
 
@@ -63,10 +62,10 @@ def command_seconds(command: list[str]) -> float:
     return time.perf_counter() - started
 
 
-def _job(command: list[str], report: Path, rounds: int) -> dict[str, float]:
+def _job(command: list[str], report: Path) -> dict[str, float]:
     """Return the median seconds of a job by part, largest first, with those of the whole command."""
     runs = []
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         seconds = command_seconds(command)
         parts = json.loads(report.read_text("utf-8"))["seconds_by_part"]
         runs.append({"command": seconds, **parts, "unnamed": seconds - sum(parts.values())})

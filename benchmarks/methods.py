@@ -1,6 +1,6 @@
 """Methods side by side on four scenes and three paintings, by the judge and by the consistency that papers report.
 
-python -m benchmarks.methods run DATA [--resolution 192]
+python -m benchmarks.methods run DATA
 python -m benchmarks.methods show [--pairs]
 
 `run` needs the folder of `benchmarks.cross_validation`, whose views, novel views and judge it uses. All methods change
@@ -70,8 +70,8 @@ METHODS: dict[str, tuple[PresetName, dict[str, Any]]] = {
 }
 #: Cameras on a full circle of the path around a scene without cameras of its own.
 CIRCLE = "orbit:60"
-#: Pairs of views that are compared per range.
-COMPARED = 3
+#: Longer side of the views in pixels, and pairs of views that are compared per range.
+RESOLUTION, COMPARED = 192, 3
 #: Title and digits of each figure of the table.
 COLUMNS = {
     "style": ("style", 3),
@@ -97,16 +97,14 @@ def main() -> None:
     """Run pairs, or print tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     ways = parser.add_subparsers(dest="way", required=True)
-    running = ways.add_parser("run")
-    running.add_argument("data", type=Path, help="folder with scenes/ and styles/")
-    running.add_argument("--resolution", type=int, default=192)
+    ways.add_parser("run").add_argument("data", type=Path, help="folder with scenes/ and styles/")
     ways.add_parser("show").add_argument("--pairs", action="store_true", help="also a table of each pair")
     arguments = parse(parser)
     if arguments.way == "run":
         for pair in PAIRS:
             if not is_of_this_code(_pairs().get(pair, {}).get("commit", "")):
-                rows = run(arguments.data, pair, arguments.resolution)
-                add_pair("methods", pair, {"resolution": arguments.resolution}, rows, presets=PRESETS)
+                rows = run(arguments.data, pair, RESOLUTION)
+                add_pair("methods", pair, {"resolution": RESOLUTION}, rows, presets=PRESETS)
                 print(f"## {pair}\n\n{table([rows])}\n", flush=True)
     print(table(list(stored().values())))
     for pair, rows in stored().items() if arguments.way == "show" and arguments.pairs else ():

@@ -1,6 +1,6 @@
 """Painted views: how well a scene follows a picture of one view, on that view and on others.
 
-python -m benchmarks.painting NAME=SCENE:CAMERAS ... [--resolution 480] [--views 24]
+python -m benchmarks.painting NAME=SCENE:CAMERAS ...
 
 CAMERAS is a camera file, or orbit:N. Each edit changes the colors of the scene itself, so it is consistent from all
 sides. The program gets one view of the edited scene, and is judged on five others, against the unchanged scene, one
@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean
-from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
@@ -29,8 +28,8 @@ from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 
-#: Number of views to judge on.
-JUDGED = 5
+#: Longer side of the views in pixels, number of views, and number of those to judge on.
+RESOLUTION, VIEWS, JUDGED = 480, 24, 5
 
 
 def night(scene: Scene, colors: Tensor) -> Tensor:
@@ -60,8 +59,6 @@ def main() -> None:
     """Measure, print and store."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", metavar="NAME=SCENE:CAMERAS")
-    parser.add_argument("--resolution", type=int, default=480)
-    parser.add_argument("--views", type=int, default=24)
     arguments = parse(parser)
     results, files = {}, {}
     for text in arguments.scenes:
@@ -69,12 +66,11 @@ def main() -> None:
         path, _, cameras = rest.partition(":")
         files[name] = Path(path)
         scene = read_scene(files[name]).scene
-        views = read_views(cameras, scene, arguments.views, arguments.resolution)
+        views = read_views(cameras, scene, VIEWS, RESOLUTION)
         results[name] = {edit: _measure(scene, views, change) for edit, change in EDITS.items()}
         for edit, figures in results[name].items():
             print(f"{name:10} {edit:10}", *(f"{key} {value:.1f}" for key, value in figures.items()), flush=True)
-    content: dict[str, Any] = {"resolution": arguments.resolution, "views": arguments.views, "scenes": results}
-    write_result("painting", content, scenes=files)
+    write_result("painting", {"resolution": RESOLUTION, "views": VIEWS, "scenes": results}, scenes=files)
 
 
 def _measure(scene: Scene, views: list[Camera], change: Callable[[Scene, Tensor], Tensor]) -> dict[str, float]:

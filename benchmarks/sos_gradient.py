@@ -1,6 +1,6 @@
 """Time and relative error of one SOS gradient of a 2048x2048 view, compared with the published block method.
 
-python -m benchmarks.sos_gradient [--size 2048] [--repeats 3]
+python -m benchmarks.sos_gradient
 
 The published block method (SPST as released with SGSST) is reimplemented here as a baseline. Blocks of 512 px with a
 margin of 256 px go through the network twice: once for statistics, once for back-propagation. The loss acts on all
@@ -32,26 +32,24 @@ from sgsst_core.style import Style
 
 #: Memory limit in bytes: enough to cache the activations of a 2048x2048 view, 1.3 KB per pixel in float32.
 MEMORY = 12 << 30
+SIZE, REPEATS = 2048, 3
 
 
 def main() -> None:
     """Measure, then print and store the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", type=int, default=2048)
-    parser.add_argument("--repeats", type=int, default=3)
-    arguments = parse(parser)
-    size = arguments.size
-    image, content = grainy_photo("astronaut", size, size), grainy_photo("coffee", size, size)
-    style_image = grainy_photo("immunohistochemistry", size, size)
+    parse(argparse.ArgumentParser(description=__doc__))
+    image, content, style_image = (
+        grainy_photo(name, SIZE, SIZE) for name in ("astronaut", "coffee", "immunohistochemistry")
+    )
     weights = load_network_weights("auto")
     methods: dict[str, Callable[[], Tensor]] = {}
 
     exact = FeatureNetwork(weights)
-    targets = SosLoss(exact, memory=MEMORY).targets.of_style(Style.of(style_image), (size, size))
+    targets = SosLoss(exact, memory=MEMORY).targets.of_style(Style.of(style_image), (SIZE, SIZE))
     methods["blocks, float32"] = lambda: block_gradient(exact, image, targets, content)
     for precision in ("float32", "bfloat16"):
         loss = SosLoss(FeatureNetwork(weights, dtype=getattr(torch, precision)), memory=MEMORY)
-        own_targets = loss.targets.of_style(Style.of(style_image), (size, size))
+        own_targets = loss.targets.of_style(Style.of(style_image), (SIZE, SIZE))
         view = loss.targets.of_view(content)
 
         def ours(loss=loss, own_targets=own_targets, view=view) -> Tensor:
@@ -63,7 +61,7 @@ def main() -> None:
 
     gradients: dict[str, Tensor] = {}
     seconds: dict[str, list[float]] = {name: [] for name in methods}
-    for _ in range(arguments.repeats):  # in turn, so that a slow phase of the machine affects all methods
+    for _ in range(REPEATS):  # in turn, so that a slow phase of the machine affects all methods
         for name, method in methods.items():
             started = time.perf_counter()
             gradients[name] = method()
@@ -82,7 +80,7 @@ def main() -> None:
             f"{name:18s} {statistics.median(times):8.2f} s  {rows[name]['times_faster_than_blocks']:6.2f} x  "
             f"relative error {rows[name]['relative_error_to_ours_float32']:.2e}"
         )
-    write_result("sos_gradient", {"size": size, "backbone": weights.name, "methods": rows})
+    write_result("sos_gradient", {"size": SIZE, "backbone": weights.name, "methods": rows})
 
 
 BLOCK = 512

@@ -33,7 +33,7 @@ from sgsst_core.bench.device_checks import (
     texture,
     views,
 )
-from sgsst_core.features.vgg import FeatureNetwork, has_bfloat16
+from sgsst_core.features.vgg import has_bfloat16
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.rasterizer import drawing_problem, make_rasterizer
 from sgsst_core.settings import make_settings
@@ -75,7 +75,7 @@ def parity(sizes: Sizes, findings: Findings) -> None:
 
 
 def poison(sizes: Sizes, findings: Findings) -> None:
-    """Run the checks of `sgsst doctor`, then steps and convolutions at the size of views."""
+    """Run the checks of `sgsst doctor`, then steps at the size of views."""
     quick = sizes == QUICK
     small: dict[str, Any] = {"gaussians": 100, "size": (32, 24), "repeats": 2, "channels": 16} if quick else {}
     for check in check_device("triton", device(), **small):
@@ -90,12 +90,6 @@ def poison(sizes: Sizes, findings: Findings) -> None:
         expected = step()
         leave_nan(device())
         findings.check(f"{width}x{height}/{name}/values_changed_by_nan", float((step() != expected).sum()), 0.0)
-        network = FeatureNetwork(weights, dtype=dtype, device=device())
-        findings.add(f"fused_convolutions/{name}/small", network.fused_layers)
-        image = texture(height, width).to(device())
-        leave_nan(device())
-        network.forward(image, cache=False)
-        findings.add(f"fused_convolutions/{name}/{width}x{height}", network.fused_layers)
 
 
 def leave_nan(device: torch.device) -> None:

@@ -68,25 +68,6 @@ def device() -> torch.device:
     return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
 
 
-def print_rows(findings: dict[str, Any]) -> None:
-    """Print findings as rows of a table, at once."""
-    for name, value in leaves(findings):
-        print(f"  {name:<58}{value:.5g}" if isinstance(value, float) else f"  {name:<58}{value}", flush=True)
-
-
-def leaves(tree: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
-    """Return all leaf values with their paths; of a long list of numbers, only the first and last values."""
-    lines: list[tuple[str, Any]] = []
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            lines += leaves(value, f"{above}{name}/")
-        elif isinstance(value, list) and value and isinstance(value[0], float) and len(value) > 4:
-            lines.append((above + name, f"{value[0]:.5g} ... {value[-1]:.5g}, {len(value)} values"))
-        else:
-            lines.append((above + name, value))
-    return lines
-
-
 class Findings:
     """Findings of a part, printed and written to a file one by one, so that none are lost if the part is killed.
 
@@ -108,7 +89,7 @@ class Findings:
             entries = entries.setdefault(group, {})
         entries[last] = value
         self._write()
-        print_rows({name: value})
+        print(f"  {name:<58}{value!s:.200}", flush=True)
 
     def check(self, name: str, error: float, bound: float) -> None:
         """Add an error with its bound. If it exceeds the bound, the part continues, but counts as failed."""

@@ -1,21 +1,19 @@
 """Ahead-of-time compilation of all GPU kernels for real targets, without a GPU or driver, and their resource usage.
 
-    python -m benchmarks.triton_targets
+    python -m tests.sgsst_core.rasterizer.triton_targets
 
 Triton's interpreter accepts code that does not compile, so both are needed: tests in the interpreter check the kernels'
-results, and this benchmark checks that they compile. Registers and spills are read from the compilers' output, and the
-instructions that the compositing kernels execute for each pixel of a pair of Gaussian and raster tile from NVIDIA's
-disassembler.
+results, and this module prints as JSON what compiling them gives. Registers and spills are read from the compilers'
+output, and the instructions that the compositing kernels execute for each pixel of a pair of Gaussian and raster tile
+from NVIDIA's disassembler.
 """
 
 from __future__ import annotations
 
-import os
+import json
 import re
 import subprocess
-import sys
 import tempfile
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -222,7 +220,7 @@ KERNELS: dict[str, Target] = {
 
 
 def compile_kernel(name: str, target: str) -> dict[str, Any]:
-    """Compile one kernel for one target, and return registers, spills, shared memory and compile time."""
+    """Compile one kernel for one target, and return registers and spills."""
     kernel = KERNELS[name]
     signature = {
         argument: "constexpr" if argument in kernel.constants else {**_TYPES, **kernel.types}[argument]
@@ -232,14 +230,10 @@ def compile_kernel(name: str, target: str) -> dict[str, Any]:
     aligned = [index for index, types in enumerate(signature.values()) if types.startswith("*")]
     hints = {(index,): [["tt.divisibility", 16]] for index in aligned}
     source = ASTSource(kernel.kernel, signature, constexprs=kernel.constants, attrs=hints)
-    started = time.perf_counter()
     compiled = triton.compile(source, target=TARGETS[target], options={"num_warps": kernel.warps})
-    seconds = time.perf_counter() - started
     if "cubin" in compiled.asm:
-        used = _of_nvidia(compiled.asm["cubin"], kernel.warps)
-    else:
-        used = _of_amd(compiled.asm["amdgcn"])
-    return {**used, "shared_bytes": compiled.metadata.shared, "seconds": round(seconds, 2)}
+        return _of_nvidia(compiled.asm["cubin"], kernel.warps)
+    return _of_amd(compiled.asm["amdgcn"])
 
 
 def _of_nvidia(binary: bytes, warps: int) -> dict[str, Any]:
@@ -299,18 +293,5 @@ def _of_amd(assembly: str) -> dict[str, int]:
     }
 
 
-def main() -> int:
-    """Compile all kernels for all targets, and print the table."""
-    if os.environ.get("TRITON_INTERPRET") == "1":
-        print("TRITON_INTERPRET is set: kernels would be interpreted, not compiled", file=sys.stderr)
-        return 2
-    os.environ["TRITON_ALWAYS_COMPILE"] = "1"  # bypass the cache, so that compile times are real
-    table = {name: {target: compile_kernel(name, target) for target in TARGETS} for name in KERNELS}
-    for name, targets in table.items():
-        for target, used in targets.items():
-            print(f"{name:<28}{target:<8}" + "  ".join(f"{key} {value}" for key, value in used.items()), flush=True)
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    print(json.dumps({name: {target: compile_kernel(name, target) for target in TARGETS} for name in KERNELS}))
