@@ -124,9 +124,7 @@ class Regions:
 
     def refined(self, refinement: Refinement | None) -> Regions:
         """Return the regions after refinement: split Gaussians inherit the region of their parent."""
-        if refinement is None:
-            return self
-        return replace(self, labels=self.labels[parents_of(refinement.pieces)])
+        return self if refinement is None else replace(self, labels=self.labels[parents_of(refinement.pieces)])
 
     def resolved(self, weights: Tensor) -> Regions:
         """Return the regions with `active` and `frozen_in_view` set.

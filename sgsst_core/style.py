@@ -68,9 +68,7 @@ class Style:
         Raises:
             ImageError: If an image cannot be used.
         """
-        if isinstance(style, Style):
-            return style.map(image_of)
-        return Style((image_of(style),))
+        return style.map(image_of) if isinstance(style, Style) else Style((image_of(style),))
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Style:
         """Return the style with a function applied to every image, or `self` if no image changes."""

@@ -257,9 +257,7 @@ def path_or_url(value: str | Path) -> Path | str:
 def split_weight(text: str, exists: Callable[[Path], bool] = Path.exists) -> tuple[str, float]:
     """Return the file and weight of FILE or FILE:WEIGHT; see `parse_style`. The weight is 1 if there is none."""
     match = _WEIGHTED.fullmatch(text)
-    if match is None or exists(Path(text)):
-        return text, 1.0
-    return match["file"], float(match["weight"])
+    return (text, 1.0) if match is None or exists(Path(text)) else (match["file"], float(match["weight"]))
 
 
 def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> StyleFile:

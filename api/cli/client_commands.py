@@ -405,9 +405,7 @@ def open_client(url: str | None, key: str | None) -> Client:
 
 def _shortened(name: str, width: int) -> str:
     """Return a name without its middle if it is too wide; names of one scene's jobs differ at their ends."""
-    if len(name) <= width:
-        return name
-    return f"{name[: (width - 1) // 2]}…{name[-(width // 2) :]}"
+    return name if len(name) <= width else f"{name[: (width - 1) // 2]}…{name[-(width // 2) :]}"
 
 
 def _print_retry(details: RetryDetails) -> None:

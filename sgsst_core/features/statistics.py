@@ -179,9 +179,7 @@ def _statistics_about(shift: Tensor, features: Tensor, position_weights: Tensor 
 
 def center(features: Tensor, mean: Tensor, out: Tensor) -> Tensor:
     """Subtract a mean [c] from features [n, w, c], in the precision of `out` [n, w, c], which is returned."""
-    if features.dtype == out.dtype:
-        return torch.sub(features, mean, out=out)
-    return out.copy_(features).sub_(mean)
+    return torch.sub(features, mean, out=out) if features.dtype == out.dtype else out.copy_(features).sub_(mean)
 
 
 class _ShiftedSums:

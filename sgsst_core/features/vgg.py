@@ -289,11 +289,6 @@ class FeatureNetwork:
         return _TF32_EPS if self.tf32 else torch.finfo(self.dtype).eps
 
     @property
-    def fused_layers(self) -> list[str]:
-        """Layers whose convolution, bias and ReLU cuDNN runs in one launch."""
-        return [step.layer for step in self._steps if isinstance(step, _Convolution) and step.fused]
-
-    @property
     def largest_tile(self) -> int | None:
         """Maximum pixels of a partition tile on a GPU, whose libraries index tensors with 32 bits; None on a CPU."""
         most = max(max(step.weight.shape[:2]) for step in self._steps[:2] if isinstance(step, _Convolution))

@@ -21,8 +21,6 @@ from sgsst_core.parallel.division import Division, Tiling
 
 #: Maximum number of cached graphs. Each takes about 1 MB, in addition to the memory pool that all graphs share.
 MAX_GRAPHS = 256
-#: Number of visits of a view before a graph speeds it up: the first visit warms up the kernels, the second is captured.
-FIRST_VISITS = 2
 #: First version of PyTorch whose allocator recovers from a failed capture.
 FIRST_TORCH = 2, 13
 

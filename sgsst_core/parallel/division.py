@@ -404,9 +404,7 @@ class Divider:
     def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
         """Return the covered partition tiles of a piece, as large as the memory budget allows."""
         tiles = self.tiling.tiles(piece.size, piece.region)
-        if coverage is None:
-            return tiles
-        return [tile for tile in tiles if coverage[tile.inner.slices].any()]
+        return tiles if coverage is None else [tile for tile in tiles if coverage[tile.inner.slices].any()]
 
 
 @dataclass(frozen=True)
@@ -436,9 +434,7 @@ class ScaledView:
 
     def weights(self, layer: str, cells: Rectangle, pyramid: PositionWeights) -> Tensor | None:
         """Return the weights [h, w] of a block of cells of a layer, as box averages; None for equal weights."""
-        if pyramid is None:
-            return None
-        return pyramid[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
+        return None if pyramid is None else pyramid[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
 
     def count(self, layer: str, pyramid: PositionWeights) -> Tensor:
         """Return the sum of the weights of all cells of a layer, float64 scalar; their number for equal weights."""

@@ -48,15 +48,12 @@ class CachedWeights(Protocol):
     @property
     def nbytes(self) -> int:
         """Size on the device in bytes."""
-        ...
 
     def render(self, colors: Tensor) -> Tensor:
         """Return the float32 image [h, w, 3] of colors [N, 3] over the background."""
-        ...
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
         """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, w, 3]."""
-        ...
 
 
 class CountedWeights(Protocol):
@@ -64,11 +61,9 @@ class CountedWeights(Protocol):
 
     def nbytes(self, precision: Precision) -> int:
         """Return the size that the weights would have in bytes."""
-        ...
 
     def store(self, precision: Precision) -> CachedWeights:
         """Compute the weights again and store them."""
-        ...
 
 
 class Rasterizer(ABC):
@@ -230,7 +225,6 @@ class Sized(Protocol):
     @property
     def nbytes(self) -> int:
         """Memory use in bytes."""
-        ...
 
 
 L = TypeVar("L", bound=Sized)

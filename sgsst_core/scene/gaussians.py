@@ -126,9 +126,7 @@ def checked_scene(scene: Scene, names: Mapping[str, str] | None = None) -> Scene
     values = {name: _checked((names or {}).get(name, name), getattr(scene, name), shapes[name]) for name in shapes}
     if not count:
         raise SceneError("The scene has no Gaussians. Give at least one.")
-    if all(values[name] is getattr(scene, name) for name in shapes):
-        return scene
-    return replace(scene, **values)
+    return scene if all(values[name] is getattr(scene, name) for name in shapes) else replace(scene, **values)
 
 
 def _checked(name: str, given: Any, shapes: tuple[tuple[int, ...], ...]) -> Any:

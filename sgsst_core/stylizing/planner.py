@@ -257,9 +257,7 @@ class Rates:
     def rate(self, pixels: float) -> float:
         """Return the rate of steps with so many pixels: the nearest remembered one, or that of a small image."""
         own, size = _read(self._path).get(self._key, {}), _size(pixels)
-        if own:
-            return own[min(own, key=lambda known: abs(int(known) - int(size)))]
-        return self._tried()
+        return own[min(own, key=lambda known: abs(int(known) - int(size)))] if own else self._tried()
 
     def remember(self, pixels: float, rate: float) -> None:
         """Remember the rate of a job's steps; one that cannot be written is forgotten."""

@@ -9,7 +9,7 @@ from torch import Tensor
 from sgsst_core.devices import Timer
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, can_use_graphs
+from sgsst_core.loss.graphs import LossGraphs, can_be_captured, can_use_graphs
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.terms import StyleTargets, ViewTarget
 from sgsst_core.parallel.division import Tiling
@@ -32,6 +32,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 HEIGHT, WIDTH = 32, 48
 SCALES = [0, 1]
+#: Number of visits of a view before a graph speeds it up: the first visit warms up the kernels, the second is captured.
+FIRST_VISITS = 2
 
 
 @pytest.fixture
