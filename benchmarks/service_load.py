@@ -189,7 +189,8 @@ async def watch(urls: Sequence[str], job_id: str) -> dict[str, Any]:
                     connected += 1
                 elif line.startswith(b"data: ") and time.time() > opened:
                     updated = _moment(json.loads(line[6:]).get("updated_at"))
-                    late.extend([time.time() - updated] * (updated > opened))
+                    if updated > opened:
+                        late.append(time.time() - updated)
         finally:
             connection.close()
 
@@ -275,6 +276,8 @@ async def measure(services: Sequence[Service], files: dict[str, Path], large: Pa
         figures["status_of_queued_jobs"] = await at_a_rate(
             urls, lambda number: f"/v1/jobs/{created[number % len(created)]}", 200, _SECONDS / 2
         )
+        job = (await client.get(f"/v1/jobs/{running}")).json()
+        assert job["status"] == "running", "the job has ended before the measurements"
     print(json.dumps(figures, indent=2))
     return figures
 
