@@ -63,8 +63,7 @@ def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
                 print(results[-1], flush=True)
     if rank == 0:
         name = arguments.scene.parent.name
-        stored = {"scene": name, "views": results}
-        write_result("ranks", stored, presets=["paper"], scenes={name: arguments.scene})
+        write_result("ranks", {"scene": name, "views": results}, presets=["paper"], scenes={name: arguments.scene})
 
 
 def compare(collectives: Collectives, build: Callable[[Collectives], Stylizer]) -> dict[str, list[float]]:
@@ -78,6 +77,7 @@ def compare(collectives: Collectives, build: Callable[[Collectives], Stylizer]) 
                 before = stylizer.seconds
                 stylizer.run_step()
                 steps[name].append(stylizer.seconds - before)
+    collectives.all_gather(None)
     return {name: each[1:] for name, each in steps.items()}
 
 
