@@ -31,6 +31,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
+from tests.sgsst_core.files.formats.samples import rewritten
 from tests.small_scenes import cameras, wall, write_files
 from tests.worker.ranks.spawn import on_ranks
 from worker.inputs import cropped, load_styles, read_shared_scene, select, select_regions
@@ -51,17 +52,6 @@ def labels_of(file: SceneFile, *requests: RegionRequest) -> list[int]:
 @pytest.fixture
 def file(tmp_path: Path) -> SceneFile:
     return read_scene(write_files(tmp_path, wall(6, 4))[0])
-
-
-def with_property(path: Path, values: np.ndarray, *, text: bool = False, order: str = "<") -> None:
-    """Add a property `extra` with these values to a PLY file."""
-    rows = PlyData.read(path)["vertex"].data
-    kinds = [*rows.dtype.descr, ("extra", values.dtype.newbyteorder("=").str)]
-    more = np.empty(len(rows), kinds)
-    for name in rows.dtype.names or ():
-        more[name] = rows[name]
-    more["extra"] = values
-    PlyData([PlyElement.describe(more, "vertex")], text=text, byte_order=order).write(path)
 
 
 def test_later_region_wins_overlaps(file: SceneFile) -> None:
@@ -88,11 +78,11 @@ def test_crop_leaves_what_is_not_frozen_if_the_rest_is(file: SceneFile) -> None:
 
 
 @pytest.mark.parametrize("kind", ["i4", "u1", "f8", "f4"])
-@pytest.mark.parametrize(("text", "order"), [(True, "="), (False, "<"), (False, ">")])
-def test_extra_properties_are_selectable(tmp_path: Path, kind: str, text: bool, order: str) -> None:
+@pytest.mark.parametrize("form", ["text", "little", "big"])
+def test_extra_properties_are_selectable(tmp_path: Path, kind: str, form: str) -> None:
     path = write_files(tmp_path, wall(6, 4))[0]
     values = np.arange(24).astype(kind)
-    with_property(path, values, text=text, order=order)
+    rewritten(path, path.name, lambda name: kind if name == "extra" else "f4", form=form, extra=values)
     selection = parse_selection("property=extra>=20", "a")
     assert select(selection, read_scene(path), cameras(), 0.2).tolist() == (values >= 20).tolist()
     assert int(select(parse_selection("property=extra=7", "a"), read_scene(path), cameras(), 0.2).sum()) == 1
@@ -110,7 +100,7 @@ def test_standard_properties_are_selectable_in_every_format(tmp_path: Path, file
 
 def test_dropped_rows_are_dropped_from_masks_and_properties(tmp_path: Path) -> None:
     path = write_files(tmp_path, wall(6, 4))[0]
-    with_property(path, np.arange(24).astype("f4"))
+    rewritten(path, path.name, lambda _: "f4", extra=np.arange(24))
     rows = PlyData.read(path)["vertex"].data.copy()
     rows["x"][3] = np.nan
     PlyData([PlyElement.describe(rows, "vertex")]).write(path)

@@ -37,13 +37,14 @@ from sgsst_core.scene.spherical_harmonics import (
     view_directions,
 )
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
+from tests.sgsst_core.files.formats.samples import rewritten
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
 
 def sphere(polar: int = 64, around: int = 128) -> tuple[Tensor, Tensor]:
     """Return directions and weights of a quadrature on the sphere that is exact for products of basis functions."""
     step = 2 * math.pi / around
-    x, w = torch.from_numpy(_gauss(polar)[0]), torch.from_numpy(_gauss(polar)[1])
+    x, w = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(polar))
     angle = torch.arange(around, dtype=torch.float64) * step
     ring = (1 - x * x).sqrt()
     directions = torch.stack(
@@ -55,12 +56,6 @@ def sphere(polar: int = 64, around: int = 128) -> tuple[Tensor, Tensor]:
         dim=-1,
     )
     return directions, (w[:, None] * step).expand(-1, around).flatten()
-
-
-def _gauss(count: int) -> tuple:
-    import numpy as np
-
-    return np.polynomial.legendre.leggauss(count)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -247,7 +242,7 @@ def written(folder: Path, count: int = 100, degree: int = 3) -> Path:
     return folder / "scene.ply"
 
 
-def rewritten(path: Path, comment: bytes, extra: tuple[str, ...], position: int, elements: bytes) -> None:
+def extend(path: Path, comment: bytes, extra: tuple[str, ...], position: int, elements: bytes) -> None:
     """Write another file of the same scene, with a comment, extra properties or additional leading elements."""
     raw = path.read_bytes()
     head, _, body = raw.partition(b"end_header\n")
@@ -286,7 +281,7 @@ def test_stored_harmonics_of_any_layout_equal_those_in_memory(
     mask: int,
 ) -> None:
     path = written(tmp_path_factory.mktemp("stored"), count, degree)
-    rewritten(path, comment, extra, position, elements)
+    extend(path, comment, extra, position, elements)
     stored, plain = both(path)
     view = camera(pose=rotated_pose())
     for name in ("means", "quats", "scales", "opacities", "sh_dc"):
@@ -304,32 +299,15 @@ def test_stored_harmonics_of_any_layout_equal_those_in_memory(
     assert torch.equal(*(held(scene.subset(jumbled).sh_rest) for scene in (stored, plain)))
 
 
-@pytest.mark.parametrize("change", ["big_endian", "doubles", "order", "text", "odd rows"])
-def test_unsupported_layouts_are_read_into_memory(tmp_path: Path, change: str) -> None:
-    path = written(tmp_path, 5, 1)
-    data = path.read_bytes()
-    expected = held(read_scene(path).scene.sh_rest)
-    head, _, body = data.partition(b"end_header\n")
-    names = [line.split()[-1].decode() for line in head.splitlines() if b"property" in line]
-    rows = np.frombuffer(body, [(name, "<f4") for name in names])
-    if change == "big_endian":
-        head = head.replace(b"little", b"big")
-        body = rows.astype(rows.dtype.newbyteorder(">")).tobytes()
-    elif change == "doubles":
-        head = head.replace(b"float f_rest_4", b"double f_rest_4")
-        body = rows.astype([(name, "<f8" if name == "f_rest_4" else "<f4") for name in names]).tobytes()
-    elif change == "order":
-        swapped = {"f_rest_3": "f_rest_5", "f_rest_5": "f_rest_3"}
-        head = head.replace(b"f_rest_3", b"?").replace(b"f_rest_5", b"f_rest_3").replace(b"?", b"f_rest_5")
-        body = np.array([tuple(row) for row in rows[[swapped.get(name, name) for name in names]]], "<f4").tobytes()
-    elif change == "text":
-        head = head.replace(b"binary_little_endian", b"ascii")
-        body = b"".join(b" ".join(repr(float(v)).encode() for v in row) + b"\n" for row in rows.tolist())
-    else:
-        head = head + b"property uchar odd\n"
-        body = b"".join(body[i * rows.itemsize : (i + 1) * rows.itemsize] + b"\x07" for i in range(len(rows)))
-    path.write_bytes(head + b"end_header\n" + body)
-    scene = read_scene(path, held_bytes=0).scene
+@pytest.mark.parametrize(
+    ("form", "kinds"),
+    [("big", {}), ("text", {}), ("little", {"f_rest_4": "f8"}), ("mixed up", {}), ("little", {"odd": "u1"})],
+)
+def test_unsupported_layouts_are_read_into_memory(tmp_path: Path, form: str, kinds: dict[str, str]) -> None:
+    path = written(tmp_path, 5)
+    expected, odd = held(read_scene(path).scene.sh_rest), {"odd": 7} if "odd" in kinds else {}
+    other = rewritten(path, "other.ply", lambda name: kinds.get(name, "f4"), form=form, **odd)
+    scene = read_scene(other, held_bytes=0).scene
     assert isinstance(scene.sh_rest, Tensor)
     assert torch.equal(scene.sh_rest, expected)
 

@@ -14,6 +14,7 @@ import gsply
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData, PlyElement
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import SceneError
@@ -62,6 +63,26 @@ def assert_close(actual: Scene, expected: Scene, *, opacities: float = 1.1e-3, o
             assert bool(torch.isfinite(first).all())
             first, second, tolerance = first.sigmoid(), second.sigmoid(), opacities
         torch.testing.assert_close(first, second, rtol=tolerance, atol=tolerance)
+
+
+def rewritten(
+    source: Path, target: str, kinds: Callable[[str], str | None], *, form: str = "little", **added: Any
+) -> Path:
+    """Write the Gaussians of a PLY to another one of its folder: little, big, as text, or mixed up.
+
+    Args:
+        kinds: Function that returns the type of a property; None to leave it out.
+        added: Values of further properties, which lie between the coefficients if properties are mixed up.
+    """
+    old = PlyData.read(source)["vertex"].data
+    names = (*old.dtype.names, *added)
+    names = (*names[20:], *names[:20]) if form == "mixed up" else names
+    rows = np.empty(len(old), [(name, kind) for name in names if (kind := kinds(name))])
+    for name in rows.dtype.names or ():
+        rows[name] = added[name] if name in added else old[name]
+    path, order = source.with_name(target), {"text": "=", "big": ">"}.get(form, "<")
+    PlyData([PlyElement.describe(rows, "vertex")], text=form == "text", byte_order=order).write(str(path))
+    return path
 
 
 def encoded(tmp_path: Path, format: SceneFormat, degree: int = 1) -> bytes:

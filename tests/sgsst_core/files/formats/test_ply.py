@@ -19,6 +19,7 @@ from sgsst_core.files.formats.ply import COMPRESSED_PLY
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.files.formats.samples import assert_close, encoded, gsply_of, refused, scene_of
 from tests.sgsst_core.splat_scenes import cloud
@@ -86,6 +87,7 @@ def test_isotropic_scales_are_read(tmp_path: Path, name: str) -> None:
     save(path, columns | {name: scene.scales[:, 1].numpy()})
     file = read_scene(path, held_bytes=0)
     assert torch.equal(file.scene.scales, scene.scales[:, 1:2].expand(-1, 3))
+    assert file.scene.rendering == CLASSIC, "not flat"
     assert torch.equal(held(file.scene.sh_rest), held(scene.sh_rest))
     write_stylized(file, out, scene.sh_dc + 1)
     assert torch.equal(read_scene(out).scene.scales, file.scene.scales)
