@@ -111,11 +111,6 @@ def test_opacity_cutoff_is_exact_to_one_ulp() -> None:
         assert len(splat(one, camera()).gaussians) == visible
 
 
-def test_gaussians_without_projection_are_dropped() -> None:
-    scene = gaussian_cases._scales()
-    assert len(project(scene, camera()).gaussians) == len(scene) - 3 == 5
-
-
 def test_barely_visible_gaussians_move_as_fast_as_others() -> None:
     """Adam's steps do not depend on the magnitude of the gradient, which is why such colors diverge."""
     walls = optimization_cases._walls((2.0, 5), (3.0, 1), (2.0, 5), (1.0, 5))

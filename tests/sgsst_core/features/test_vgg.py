@@ -75,28 +75,18 @@ def on_a_gpu(device: torch.device, **flags: bool) -> contextlib.AbstractContextM
 def test_flags_are_set_only_within_the_network(
     tiny_weights: BackboneWeights, tf32: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The network runs on the CPU, but sets the flags as on a GPU."""
+    """The network runs on the CPU, but sets the flags as on a GPU. Statistics are summed in full float32 meanwhile."""
     use_whole_float32()
-    network = Watched(tiny_weights, tf32=tf32)
+    network, seen = Watched(tiny_weights, tf32=tf32), set[str]()
     monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
-    pixel_gradient(network)
+    activations = network.forward(synthetic_image())
+    network.backward(activations, lambda *_: seen.add(torch.backends.cuda.matmul.fp32_precision))
+    assert seen == {"ieee"}
     assert network.flags == {("tf32" if tf32 else "ieee", False, True)}
     assert not CUDNN.allow_tf32
     assert not CUDNN.deterministic
     assert not torch.backends.cuda.matmul.allow_tf32
     assert network.precision == ("tf32" if tf32 else "float32")
-
-
-def test_statistics_are_summed_in_full_float32(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The callback runs in the middle of the backward pass."""
-    use_whole_float32()
-    monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
-    network = FeatureNetwork(tiny_weights, tf32=True)
-    seen = []
-    network.backward(
-        network.forward(synthetic_image()), lambda *_: seen.append(torch.backends.cuda.matmul.fp32_precision)
-    )
-    assert set(seen) == {"ieee"}
 
 
 @pytest.mark.parametrize("before", ["ieee", "tf32", "none"])

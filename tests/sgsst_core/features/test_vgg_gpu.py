@@ -1,17 +1,16 @@
 """Tests of the feature network on a GPU against float64 on the CPU.
 
-Their counterparts without a GPU are in test_vgg, test_precision and test_timing.
+Their counterparts without a GPU are in test_vgg and test_devices.
 """
 
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.devices import Timer
 from sgsst_core.features import vgg
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
+from sgsst_core.features.vgg import FeatureNetwork, has_tf32, use_whole_float32
 from sgsst_core.quality.measure import Difference
 from tests.sgsst_core.synthetic_images import synthetic_image
 
@@ -45,25 +44,6 @@ def test_lower_precisions_differ_by_their_rounding(vgg16_weights: BackboneWeight
     error = difference(vgg16_weights, torch.float32 if tf32 else torch.bfloat16, tf32=tf32)
     print(error)
     assert 1e-3 < error.relative_error < (0.2 if tf32 else 0.8)
-
-
-def test_tf32_is_enabled_only_within_the_block() -> None:
-    if not has_tf32("cuda"):
-        pytest.skip("this GPU has no TF32")
-    use_whole_float32()
-    generator = torch.Generator().manual_seed(0)
-    image, kernel = (torch.randn(*shape, generator=generator).cuda() for shape in ((1, 64, 64, 64), (64, 64, 3, 3)))
-    exact = F.conv2d(image.double(), kernel.double(), padding=1)
-    errors = []
-    for block in (True, False):
-        if block:
-            with convolutions(image.device, tf32=True):
-                actual = F.conv2d(image, kernel, padding=1)
-        else:
-            actual = F.conv2d(image, kernel, padding=1)
-        errors.append(Difference.of(actual.double(), exact).relative_error)
-    assert 1e-5 < errors[0] < 1e-2
-    assert errors[1] < 2e-6
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

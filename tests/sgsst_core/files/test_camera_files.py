@@ -21,7 +21,6 @@ from PIL import Image
 
 from sgsst_core.errors import CameraError
 from sgsst_core.files import camera_folder as colmap_model
-from sgsst_core.files.advice import advice_for_name
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.camera_folder import CameraWarning, cameras_beside
 from sgsst_core.files.photos import check_photos, find_masks
@@ -109,13 +108,23 @@ def save(path: Path, content: Any) -> Path:
     return path
 
 
+def assert_close(
+    actual: list[Camera], expected: list[Camera], world: torch.Tensor | None = None, *, atol: float = 1e-5
+) -> None:
+    """Compare cameras, in a world that is rotated by a matrix [3, 3]."""
+    assert len(actual) == len(expected)
+    for a, b in zip(actual, expected, strict=True):
+        assert (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == pytest.approx((b.width, b.height, b.fx, b.fy, b.cx, b.cy))
+        pose = b.world_to_camera.clone()
+        if world is not None:
+            pose[:3, :3] = pose[:3, :3] @ world.T
+        assert torch.allclose(a.world_to_camera, pose, atol=atol)
+
+
 def assert_same(actual: list[Camera], expected: list[Camera], names: Callable[[str], str] = lambda name: name) -> None:
     assert [view.name for view in actual] == [names(view.name) for view in expected]
-    for a, b in zip(actual, expected, strict=True):
-        assert (a.width, a.height) == (b.width, b.height)
-        assert (a.fx, a.fy, a.cx, a.cy) == pytest.approx((b.fx, b.fy, b.cx, b.cy))
-        assert a.world_to_camera.dtype == torch.float64
-        assert torch.allclose(a.world_to_camera, b.world_to_camera, atol=1e-12)
+    assert {view.world_to_camera.dtype for view in actual} == {torch.float64}
+    assert_close(actual, expected, atol=1e-12)
 
 
 def test_inria_cameras_are_read(tmp_path: Path) -> None:
@@ -123,12 +132,6 @@ def test_inria_cameras_are_read(tmp_path: Path) -> None:
     assert_same(read_cameras(save(tmp_path / "any_name.json", inria(cameras))), cameras)
     save(tmp_path / "cameras.json", inria(cameras))
     assert_same(read_cameras(tmp_path), cameras)
-
-
-def test_principal_points_of_cameras_json_are_read(tmp_path: Path) -> None:
-    entries = [entry | {"cx": 300.0, "cy": 250.5} for entry in inria(views())]
-    expected = [replace(view, cx=300.0, cy=250.5) for view in views()]
-    assert_same(read_cameras(save(tmp_path / "cameras.json", entries)), expected)
 
 
 def test_nerfstudio_cameras_are_read(tmp_path: Path) -> None:
@@ -209,8 +212,10 @@ def test_error_about_a_folder_names_a_model_below(tmp_path: Path, model: str) ->
     assert len(read_cameras(tmp_path / model)) == 2
 
 
-def test_null_counts_as_not_stated(tmp_path: Path) -> None:
-    content, entries = nerfstudio(views(1)), inria(views(1))
+def test_principal_points_are_read_and_null_counts_as_not_stated(tmp_path: Path) -> None:
+    content, entries = nerfstudio(views(1)), [inria(views(1))[0] | {"cx": 300.0, "cy": 250.5}]
+    expected = [replace(view, cx=300.0, cy=250.5) for view in views(1)]
+    assert_same(read_cameras(save(tmp_path / "t.json", entries)), expected)
     content |= {"cx": None, "fl_y": None}
     entries[0] |= {"cx": None, "cy": None}
     content["frames"][0]["w"] = None
@@ -331,12 +336,8 @@ def test_unreadable_colmap_models_are_refused(tmp_path: Path) -> None:
     (folder / "images.txt").unlink()
     with pytest.raises(CameraError, match=r"images\.txt: cannot be read: No such file"):
         read_cameras(folder)
-    empty = colmap(tmp_path / "empty", [], text=False)
     with pytest.raises(CameraError, match="no registered image"):
-        read_cameras(empty)
-    (empty / "images.bin").unlink()
-    with pytest.raises(CameraError, match=r"images\.bin: cannot be read: No such file"):
-        read_cameras(empty)
+        read_cameras(colmap(tmp_path / "empty", [], text=False))
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -671,11 +672,9 @@ def test_unknown_formats_are_refused(tmp_path: Path, data: bytes, message: str) 
         read_cameras(path)
 
 
-def test_missing_files_and_folders_without_cameras_are_refused(tmp_path: Path) -> None:
+def test_missing_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CameraError, match="No such file"):
         read_cameras(tmp_path / "none.json")
-    with pytest.raises(CameraError, match="holds no cameras in a known format"):
-        read_cameras(tmp_path)
 
 
 def test_real_colmap_model_matches_cameras_json(shared_data: Path) -> None:
@@ -688,17 +687,6 @@ def test_real_colmap_model_matches_cameras_json(shared_data: Path) -> None:
 CAPTURES = Path(__file__).parent / "captures"
 #: nerfstudio's axes: x, z, -y of COLMAP's world.
 NERFSTUDIO = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
-
-
-def assert_close(actual: list[Camera], expected: list[Camera], world: torch.Tensor | None = None) -> None:
-    """Compare cameras, in a world that is rotated by a matrix [3, 3]."""
-    assert len(actual) == len(expected)
-    for a, b in zip(actual, expected, strict=True):
-        assert (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == pytest.approx((b.width, b.height, b.fx, b.fy, b.cx, b.cy))
-        pose = b.world_to_camera.clone()
-        if world is not None:
-            pose[:3, :3] = pose[:3, :3] @ world.T
-        assert torch.allclose(a.world_to_camera, pose, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -964,9 +952,3 @@ def test_damaged_files_are_read_or_refused_with_a_message(tmp_path: Path, name: 
                 reduced = undistorted(view)
                 assert 1 <= reduced.width <= view.width
                 assert 1 <= reduced.height <= view.height
-
-
-def test_file_name_suggests_a_format() -> None:
-    assert advice_for_name("My Export.CSV").startswith(" It may be cameras of RealityCapture. ")
-    assert advice_for_name("data.ZIP").startswith(" It may be an archive. Unpack it")
-    assert advice_for_name("cameras.doc") == ""

@@ -235,6 +235,8 @@ def test_children_of_split_gaussians_inherit_all_properties(
     refinement = Refinement(pieces, 2, int(piece_counts(pieces).sum()))
     refined = source.refined(refinement)
     assert source.refined(None) is source
+    with pytest.raises(SceneError, match="split already"):
+        refined.refined(refinement)
     assert refined.dropped == int(dropped)
     colors = torch.rand(len(refined.scene), 3)
     write_stylized(refined, tmp_path / "out.ply", colors)

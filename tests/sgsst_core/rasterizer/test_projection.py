@@ -14,6 +14,9 @@ from sgsst_core.rasterizer.projection import (
     project,
 )
 from sgsst_core.rasterizer.reference import splat
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import Rendering
 from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, rotated_pose, single, together
 
 _HALF_LOG2_E = 0.5 * math.log2(math.e)
@@ -44,27 +47,44 @@ def test_projection_agrees_with_plain_pytorch() -> None:
     assert 0 < len(fast.gaussians) < len(scene)
 
 
-@pytest.mark.parametrize("length", [1.0, 1e3, 1e6])
-def test_needles_have_their_exact_width(length: float) -> None:
-    """The determinant of a slanted needle, a million times longer than wide, matches exact arithmetic."""
-    half = math.sqrt(0.5)
-    view = camera(focal=64.0)
-    scene = single((0.0, 0.0, 4.0), scales=(length, length * 1e-6, length * 1e-6), quat=(math.cos(0.3), 0, 0, half))
-    row = project(scene, view).values[0]
-    assert np.isfinite(row).all()
+def slanted_needle(length: float) -> tuple[Scene, Camera, Fraction, Fraction, Fraction]:
+    """Return a Gaussian a million times longer than wide, its view, and its exact covariance: variances and between."""
+    view, width = camera(focal=64.0), length * 1e-6
+    scene = single((0.0, 0.0, 4.0), scales=(length, width, width), quat=(math.cos(0.3), 0, 0, math.sqrt(0.5)))
     w, _, _, z = (Fraction(float(v)) for v in scene.quats[0])
     n2 = w * w + z * z
     cos, sin = (w * w - z * z) / n2, 2 * w * z / n2
     s = [Fraction(float(v)) for v in scene.scales[0].double().exp()]
     fx, fy = Fraction(view.fx) / 4, Fraction(view.fy) / 4
     m0, m1 = (fx * cos * s[0], -fx * sin * s[1]), (fy * sin * s[0], fy * cos * s[1])
-    eps = Fraction(EPS2D)
-    p, q, r = m0[0] ** 2 + m0[1] ** 2 + eps, m0[0] * m1[0] + m0[1] * m1[1], m1[0] ** 2 + m1[1] ** 2 + eps
+    return scene, view, m0[0] ** 2 + m0[1] ** 2, m0[0] * m1[0] + m0[1] * m1[1], m1[0] ** 2 + m1[1] ** 2
+
+
+@pytest.mark.parametrize("length", [1.0, 1e3, 1e6])
+def test_needles_have_their_exact_width(length: float) -> None:
+    scene, view, p, q, r = slanted_needle(length)
+    row = project(scene, view).values[0]
+    assert np.isfinite(row).all()
+    p, r = p + Fraction(EPS2D), r + Fraction(EPS2D)
     det = p * r - q * q
     # The tolerance is 1e-7, because projection and test compute float64 exponentials of float32 logarithms.
     assert row[Column.SKEW] == pytest.approx(float(q / r), rel=1e-12)
     assert row[Column.U_SCALE] ** 2 == pytest.approx(_HALF_LOG2_E * float(r / det), rel=1e-9)
     assert row[Column.W_SCALE] ** 2 == pytest.approx(_HALF_LOG2_E / float(r), rel=1e-12)
+
+
+@pytest.mark.parametrize("length", [1.0, 1e3, 1e6])
+def test_compensation_matches_exact_arithmetic(length: float) -> None:
+    """The plain formula p r - q^2 would have no correct digit for a needle."""
+    scene, view, p, q, r = slanted_needle(length)
+    scene, eps = replace(scene, opacities=torch.tensor([20.0]), rendering=Rendering("antialiased", 0.1)), Fraction(0.1)
+    expected = math.sqrt(float((p * r - q * q) / ((p + eps) * (r + eps) - q * q)))
+    opacity = float(scene.opacities.double().sigmoid()) * expected
+    if opacity < 1 / 255:
+        assert not len(project(scene, view).gaussians)
+        return
+    assert 2 ** project(scene, view).values[0][Column.LOG2_OPACITY] == pytest.approx(opacity, rel=1e-9)
+    assert float(splat(scene, view).opacity[0]) == pytest.approx(opacity, rel=1e-9)
 
 
 def test_gaussian_on_the_near_plane_is_visible() -> None:

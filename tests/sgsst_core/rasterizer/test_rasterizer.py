@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from sgsst_core.errors import SettingsError, TooManyIntersectionsError
+from sgsst_core.errors import SettingsError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
@@ -23,9 +22,6 @@ from sgsst_core.orbit import orbit
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.projection import (
-    MAX_INTERSECTIONS,
-    Column,
-    check_intersections,
     project,
 )
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
@@ -277,12 +273,6 @@ def test_unknown_rasterizers_and_devices_are_refused() -> None:
         make_rasterizer("cpu", cloud(10), device="cuda")
 
 
-def test_too_many_intersections_error_has_figures() -> None:
-    check_intersections(MAX_INTERSECTIONS, 5, camera())
-    with pytest.raises(TooManyIntersectionsError, match=r"'test' \(70x45\): its 5 visible .* 2,147,483,648 times"):
-        check_intersections(MAX_INTERSECTIONS + 1, 5, camera())
-
-
 @pytest.mark.slow
 def test_kernels_run_without_a_writable_folder(tmp_path: Path) -> None:
     """If no folder is writable, machine code is kept in memory only; Numba itself would raise an error at import."""
@@ -367,28 +357,6 @@ def test_rasterizers_agree_with_an_independent_renderer(rendering: Rendering, lo
     for name in CPU:
         image = make_rasterizer(name, replace(scene, rendering=rendering)).render(colors, view)
         assert independent.psnr(image.double().numpy(), expected) > 60, name
-
-
-@pytest.mark.parametrize("length", [1.0, 1e3, 1e6])
-def test_compensation_matches_exact_arithmetic(length: float) -> None:
-    """The plain formula p r - q^2 would have no correct digit for a needle."""
-    view, width = camera(focal=64.0), length * 1e-6
-    scene = single((0.0, 0.0, 4.0), scales=(length, width, width), quat=(math.cos(0.3), 0, 0, math.sqrt(0.5)))
-    scene = replace(scene, opacities=torch.tensor([20.0]), rendering=Rendering("antialiased", 0.1))
-    w, _, _, z = (Fraction(float(v)) for v in scene.quats[0])
-    n2 = w * w + z * z
-    cos, sin = (w * w - z * z) / n2, 2 * w * z / n2
-    s = [Fraction(float(v)) for v in scene.scales[0].double().exp()]
-    fx, fy, eps = Fraction(view.fx) / 4, Fraction(view.fy) / 4, Fraction(0.1)
-    m0, m1 = (fx * cos * s[0], -fx * sin * s[1]), (fy * sin * s[0], fy * cos * s[1])
-    p, q, r = m0[0] ** 2 + m0[1] ** 2, m0[0] * m1[0] + m0[1] * m1[1], m1[0] ** 2 + m1[1] ** 2
-    expected = math.sqrt(float((p * r - q * q) / ((p + eps) * (r + eps) - q * q)))
-    opacity = float(scene.opacities.double().sigmoid()) * expected
-    if opacity < 1 / 255:
-        assert not len(project(scene, view).gaussians)
-        return
-    assert 2 ** project(scene, view).values[0][Column.LOG2_OPACITY] == pytest.approx(opacity, rel=1e-9)
-    assert float(splat(scene, view).opacity[0]) == pytest.approx(opacity, rel=1e-9)
 
 
 def test_extreme_shapes_are_drawn_or_dropped() -> None:

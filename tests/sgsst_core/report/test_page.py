@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from PIL import Image, ImageColor
 
-from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.report.charts import BINS, running_mean, thinned, write_loss_chart
 from sgsst_core.report.document import Sources, build_report
@@ -323,12 +322,6 @@ def test_page_of_a_real_job_is_self_contained(tiny_weights: BackboneWeights, tmp
     assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"][:2] == ["loss", "split"]
 
 
-def test_unwritable_page_is_an_output_error(tmp_path: Path) -> None:
-    with pytest.raises(OutputError):
-        write_page(tmp_path / "missing" / "page.html", sample_report(0, 0), None)
-    assert list(tmp_path.iterdir()) == []
-
-
 def colors_in(path: Path) -> set[tuple[int, ...]]:
     with Image.open(path) as image:
         assert image.format == "PNG"
@@ -349,12 +342,6 @@ def test_chart_without_steps_has_only_axes(tmp_path: Path) -> None:
     colors = colors_in(tmp_path / "c.png")
     assert ImageColor.getrgb(INK) in colors
     assert not colors & {ImageColor.getrgb(color) for color in COLORS}
-
-
-def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
-    with pytest.raises(OutputError):
-        write_loss_chart(tmp_path / "missing" / "c.png", sample_report())
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

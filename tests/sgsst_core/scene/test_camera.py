@@ -418,15 +418,6 @@ def test_small_views_of_large_photos_do_not_alias() -> None:
     assert float((small - 0.5).abs()[:, 2:-2].max()) < 0.03
 
 
-def test_coefficients_of_0_are_no_distortion() -> None:
-    for model in ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"):
-        intrinsics = 3 if "RADIAL" in model else 4
-        parameters = LENSES[model][:intrinsics] + [0.0] * (len(LENSES[model]) - intrinsics)
-        assert not lens(model, parameters).distorts
-        assert lens(model).distorts
-    assert lens("FISHEYE").distorts  # equal angles are not equal lengths
-
-
 @pytest.mark.parametrize(
     "values", [(float("inf"),), (-1e6,), (1e300, 1e300), (0, 0, 5.0, 5.0), (0, 0, 0, 0, 0, -900.0)]
 )

@@ -34,7 +34,6 @@ from sgsst_core.scene.spherical_harmonics import (
     rest_colors,
     view_colors,
     view_colors_gradient,
-    view_directions,
 )
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.files.formats.samples import rewritten
@@ -104,18 +103,6 @@ def test_basis_has_signs_and_order_of_3dgs_files() -> None:
     ]
     actual = basis(torch.tensor([x, y, z], dtype=torch.float64), 3)
     assert torch.allclose(actual, torch.tensor(expected, dtype=torch.float64), atol=1e-14)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_rest_colors_are_sums_over_the_basis(degree: int) -> None:
-    scene, view = cloud(50, degree=3), camera(pose=rotated_pose())
-    count = (degree + 1) ** 2 - 1
-    alone = rest_colors(held(scene.sh_rest)[:, :count], scene.means, view)
-    values = basis(view_directions(scene.means, view.center), degree)
-    expected = (values[:, :, None] * held(scene.sh_rest)[:, :count].double()).sum(1)
-    assert alone.dtype == torch.float32
-    assert torch.allclose(alone.double(), expected, atol=1e-6)
-    assert degree > 0 or not alone.any()
 
 
 def far_from_the_origin() -> tuple[Scene, Camera]:

@@ -9,9 +9,7 @@ import torch
 import torch.multiprocessing as multiprocessing
 from torch import Tensor
 
-from benchmarks.stability.sos_reference import layer_statistics_reference
 from sgsst_core.features.network_weights import load_network_weights
-from sgsst_core.features.statistics import layer_statistics
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -61,36 +59,6 @@ def test_nccl_gradient_matches_one_rank(name: str, tmp_path: Path, exact_convolu
     for own in actual:
         assert torch.equal(own, actual[0])
     assert relative_error(actual[0], expected) < 1e-5
-
-
-def merge_three(rank: int, size: int, address: str, folder: str) -> None:
-    """Merge statistics of three scales at once."""
-    with process_group(rank, size, address, device=f"cuda:{rank}", timeout=timedelta(seconds=60)) as collectives:
-        own = [layer_statistics(features(10 * turn + rank).to(f"cuda:{rank}")) for turn in range(3)]
-        numbers = torch.arange(3, dtype=torch.float64, device=f"cuda:{rank}") + 0.5
-        merged, added = collectives.all_reduce_statistics(own, numbers)
-        sums = [(part.count, part.mean, part.centered, number) for part, number in zip(merged, added, strict=True)]
-        torch.save([[value.cpu() for value in values] for values in sums], Path(folder) / f"{rank}.pt")
-
-
-def features(seed: int) -> Tensor:
-    return 3.0 + torch.randn(30, 20, 16, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA GPUs")
-def test_statistics_of_scales_merge_at_once(tmp_path: Path) -> None:
-    address = f"127.0.0.1:{free_port()}"
-    multiprocessing.spawn(  # type: ignore[attr-defined]
-        merge_three, (2, address, str(tmp_path)), nprocs=2
-    )
-    first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in range(2))
-    for turn, (own, other) in enumerate(zip(first, second, strict=True)):
-        expected = layer_statistics_reference(torch.cat([features(10 * turn), features(10 * turn + 1)]))
-        for value, same in zip(own, other, strict=True):
-            assert torch.equal(value, same)
-        for value, reference in zip(own, (expected.count, expected.mean, expected.centered), strict=False):
-            assert relative_error(value, reference) < 1e-12
-        assert float(own[3]) == 2 * turn + 1
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")

@@ -201,16 +201,6 @@ def test_required_extensions_of_other_objects_are_harmless(tmp_path: Path, name:
     assert len(read(tmp_path, by_hand(extensionsRequired=required))) == 2
 
 
-def test_rows_beyond_the_declared_ones_are_counted(tmp_path: Path) -> None:
-    """The rows of two Gaussians are interleaved, of which the header counts one."""
-    document, data = split(by_hand())
-    for entry in document["accessors"]:
-        entry["count"] = 1
-    (tmp_path / "scene.glb").write_bytes(joined(document, data))
-    (note,) = read_scene(tmp_path / "scene.glb").notes
-    assert note.startswith("the file has 48 bytes more than its header declares")
-
-
 def test_animations_are_noted(tmp_path: Path) -> None:
     (tmp_path / "scene.glb").write_bytes(by_hand(animations=[{"channels": [], "samplers": []}]))
     assert read_scene(tmp_path / "scene.glb").notes == ("animations are left out",)

@@ -4,7 +4,6 @@ import gzip
 import json
 import re
 import struct
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -136,27 +135,10 @@ def test_doubtful_comments_give_warnings(tmp_path: Path) -> None:
 def test_written_files_state_the_render_mode(tmp_path: Path, format: SceneFormat, rendering: Rendering) -> None:
     path = tmp_path / "scene.any"
     write_scene(path, replace(wall(sh_degree=1), rendering=rendering), format)
-    loaded = read_scene(path).scene.rendering
+    file = read_scene(path)
     if format.name.endswith("spz"):  # has a flag for antialiased scenes only
         rendering = AA if rendering.antialiased else CLASSIC
-    assert loaded == rendering
-
-
-@pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
-def test_classic_scenes_state_no_render_mode(tmp_path: Path, format: SceneFormat) -> None:
-    path = tmp_path / "scene.any"
-    write_scene(path, wall(), format)
-    data = path.read_bytes()
-    if format.name == "sog":
-        with zipfile.ZipFile(path) as archive:
-            assert not {"model", "extras"} & json.loads(archive.read("meta.json")).keys()
-    elif format.name == "v3.spz":
-        assert gzip.decompress(data)[14] == 0
-    elif format.name == "spz":
-        assert data[14] == 2
-    else:
-        assert b"comment" not in data[:4000]
-    assert read_scene(path).tag.reason == ""
+    assert (file.scene.rendering, bool(file.tag.reason)) == (rendering, rendering != CLASSIC)
 
 
 def test_flag_of_old_spz_files_is_ignored(tmp_path: Path) -> None:

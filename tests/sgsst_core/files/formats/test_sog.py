@@ -37,11 +37,6 @@ from tests.sgsst_core.splat_scenes import cloud
 from tests.small_scenes import wall
 
 
-def unzipped(data: bytes) -> Files:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
-
-
 def zipped(files: Files, method: int = zipfile.ZIP_STORED) -> bytes:
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w", method) as archive:
@@ -153,13 +148,11 @@ def test_missing_first_value_of_a_codebook_is_extrapolated(tmp_path: Path) -> No
 
 
 def test_folder_is_read_by_its_meta_json(tmp_path: Path) -> None:
-    data = encoded(tmp_path, SOG, degree=3)
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    for name, content in unzipped(data).items():
-        (folder / name).write_bytes(content)
+    encoded(tmp_path, SOG, degree=3)
+    files = files_of(tmp_path / "good")
+    folder = unpacked(tmp_path / "folder", files)
     assert_close(read_scene(folder / "meta.json").scene, read_scene(tmp_path / "good").scene, opacities=0, others=0)
-    for name in unzipped(data):
+    for name in files:
         if name.endswith(".webp"):  # the specification allows images of other formats
             Image.open(folder / name).save(folder / name, "PNG")
     assert_close(read_scene(folder / "meta.json").scene, read_scene(tmp_path / "good").scene, opacities=0, others=0)
@@ -177,7 +170,7 @@ def test_new_colors_change_only_one_image(tmp_path: Path) -> None:
     write_scene(first, cloud(3000, degree=2), SOG)
     scene = read_scene(first).scene
     write_scene(second, replace(scene, sh_dc=torch.rand(3000, 3)), SOG)
-    before, after = (unzipped(path.read_bytes()) for path in (first, second))
+    before, after = (files_of(path) for path in (first, second))
     # rotations with two components of nearly the same size can be stored in two ways
     assert {name for name in before if before[name] != after[name]} <= {"sh0.webp", "meta.json", "quats.webp"}
     assert (scene.quats - read_scene(second).scene.quats).abs().quantile(0.95) == 0
