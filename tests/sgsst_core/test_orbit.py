@@ -447,14 +447,6 @@ def test_turntable_of_a_point_or_from_within_is_finite() -> None:
 REQUEST = OrbitRequest(count=12)
 
 
-def elevations(scene: Scene, orbit: Orbit) -> list[float]:
-    """Return the elevation of each camera above the horizon, in degrees."""
-    up = orbit.up.direction
-    middle = middle_of(find_subject(scene), up)
-    offsets = [camera.center - middle for camera in orbit.cameras]
-    return [math.degrees(math.asin(float(offset @ up / offset.norm()))) for offset in offsets]
-
-
 def plan_lines(scene: Scene, orbit: Orbit) -> dict[str, Decision]:
     """Return the plan's decisions about an orbit by item."""
     cameras = [resized(camera, 64) for camera in orbit.cameras]
@@ -506,7 +498,9 @@ def test_requested_properties_are_used() -> None:
     orbit = make_orbit(scene, OrbitRequest(count=14, up=(0.0, 0.0, 1.0), elevation=35.0, radius=6.5))
     assert len(orbit.cameras) == 14
     assert orbit.up.direction.tolist() == [0, 0, 1]
-    assert elevations(scene, orbit) == pytest.approx([35.0] * 14)
+    middle = middle_of(find_subject(scene), orbit.up.direction)
+    angles = [elevation(camera, middle, orbit.up.direction) for camera in orbit.cameras]
+    assert angles == pytest.approx([35.0] * 14)
     assert orbit.radius == pytest.approx(6.5)
     decisions = plan_lines(scene, orbit)
     assert (decisions["up"].decision, decisions["up"].reason) == ("z", "requested")
@@ -589,18 +583,10 @@ def test_plan_warns_that_a_room_is_not_a_single_object(surroundings: Scene, what
     assert len(orbit.cameras) == 12
 
 
-@pytest.mark.parametrize(
-    "scene",
-    [
-        scene_of(torch.ones(1, 3)),
-        scene_of(torch.ones(3, 3), opacities=torch.full((3,), -100.0)),
-        scene_of(torch.ones(300, 3)),
-        scene_of(torch.zeros(1, 3), torch.tensor([[1e-4, 2.0, 1e-4]])),
-    ],
-)
-def test_degenerate_scenes_have_an_automatic_orbit(scene: Scene) -> None:
+@pytest.mark.parametrize("name", ["a point", "an invisible point", "coincident points", "a needle"])
+def test_degenerate_scenes_have_an_automatic_orbit(name: str) -> None:
     for request in (OrbitRequest(), OrbitRequest(count=3)):
-        orbit = make_orbit(scene, request)
+        orbit = make_orbit(ODD[name], request)
         assert all(bool(torch.isfinite(camera.world_to_camera).all()) for camera in orbit.cameras)
         assert 0 <= orbit.shown <= 1 + 1e-9
 

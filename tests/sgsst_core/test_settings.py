@@ -6,6 +6,7 @@ from sgsst_core.settings import Settings, make_settings
 
 def test_paper_is_the_published_schedule() -> None:
     settings = make_settings("paper")
+    assert (settings.feature_scale, make_settings("standard").feature_scale) == ("paper", "even")
     assert (settings.steps_coarse, settings.steps_sos) == (10_000, 10_000)
     assert settings.learning_rate == settings.learning_rate_end == 2.5e-3
     assert settings.content_weight == 1
@@ -25,9 +26,11 @@ def test_values_override_the_preset_unless_none() -> None:
     assert settings.max_resolution == 640
 
 
-def test_explicit_learning_rate_is_constant_without_an_end() -> None:
+def test_learning_rate_falls_exponentially_to_its_end_and_is_constant_without_one() -> None:
     assert make_settings("standard", learning_rate=0.2).learning_rate_end == 0.2
-    assert make_settings("standard", learning_rate=0.2, learning_rate_end=0.1).learning_rate_end == 0.1
+    settings = make_settings("standard", learning_rate=0.1, learning_rate_end=0.001)
+    rates = [settings.learning_rate_at(step / 4) for step in range(5)]
+    assert rates == pytest.approx([0.1, 0.1**1.5, 0.01, 0.1**2.5, 0.001])
 
 
 @pytest.mark.parametrize(

@@ -128,14 +128,14 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
     options = region_options(
         ["a:sphere=0,0,0,1", "c:half-space=0,1,0,0"],
         ["a=x.jpg:0.5", f"a={odd}", "rest=y=z.jpg"],
-        ["a=3", "rest=0.5"],
+        ["a=1e6", "rest=0.5"],
         ["c"],
         ["a=balanced", "rest=0.5"],
     )
     rest, first, second = region_requests(options)
     assert (rest.name, rest.selection, rest.styles, rest.weight) == (REST, None, (StyleFile(Path("y=z.jpg")),), 0.5)
     assert first.styles == (StyleFile(Path("x.jpg"), 0.5), StyleFile(odd))
-    assert (first.weight, first.freeze, second.freeze, second.styles) == (3, False, True, ())
+    assert (first.weight, first.freeze, second.freeze, second.styles) == (1e6, False, True, ())
     assert [each.content_weight for each in (rest, first, second)] == [0.5, 1e4, None]
 
 
@@ -158,6 +158,7 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
         ((["a:sphere=0,0,0,1"], [], [], [], ["a=-1"]), "the weight must be at least 0"),
         ((["a:sphere=0,0,0,1"], [], [], [], ["a=nan"]), "the weight must be at least 0"),
         (([], [], [], [], ["b=light"]), "there is no region 'b'"),
+        (([], [], ["rest=1.1e6"], []), "at most 1,000,000"),
         ((["rest:sphere=0,0,0,1"], [], [], []), "takes no SPEC"),
         ((["a:" + "x" * 1001], [], [], []), "at most 1000 characters"),
         (
@@ -193,17 +194,14 @@ def test_json_regions_have_content_weights_by_name_or_number() -> None:
         for name, weight in (("a", "light"), ("b", 7), ("c", None))
     ]
     assert [each.content_weight for each in region_requests(options)] == [3e4, 7.0, None]
-    for weight in ("much", -1, 1e13):
-        with pytest.raises(SettingsError, match="content_weight"):
-            checked(RegionOptions, {"name": "a", "select": "sphere=0,0,0,1", "content_weight": weight})
-
-
-def test_region_weights_have_a_maximum() -> None:
-    assert region_requests(region_options([], [], ["rest=1e6"], []))[0].weight == 1e6
-    with pytest.raises(SettingsError, match="at most 1,000,000"):
-        region_options([], [], ["rest=1.1e6"], [])
-    with pytest.raises(SettingsError, match="weight"):
-        checked(RegionOptions, {"name": REST, "weight": 1.1e6})
+    for name, weight in (
+        ("content_weight", "much"),
+        ("content_weight", -1),
+        ("content_weight", 1e13),
+        ("weight", 1.1e6),
+    ):
+        with pytest.raises(SettingsError, match=name):
+            checked(RegionOptions, {"name": "a", "select": "sphere=0,0,0,1", name: weight})
 
 
 def test_json_regions_need_selections_and_unique_names() -> None:

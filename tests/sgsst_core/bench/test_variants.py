@@ -1,14 +1,11 @@
 """Tests of the benchmarks that compare variants with equal time budgets, by one loss and by the judge."""
 
-import io
 import json
 from pathlib import Path
 
 import pytest
-from PIL import Image
-from rich.console import Console
 
-from api.cli.scene_tools import error_time_table, point_line, quality_table
+from api.cli.scene_tools import error_time_table, point_line
 from sgsst_core.bench.variants import (
     TRANSFER,
     UNSTYLIZED,
@@ -35,9 +32,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.mark.slow
-def test_variants_are_evaluated_at_equal_times(
-    tiny_weights: BackboneWeights, vgg16_weights: object, tmp_path: Path
-) -> None:
+def test_variants_are_evaluated_at_equal_times(tiny_weights: BackboneWeights, vgg16_weights: object) -> None:
     """AlexNet's weights, which judge results, are installed together with VGG16's."""
     names = ["standard", "coarse-only", "all-scales", "cold-start", "half-weights"]
     scene, views = wall(), cameras(2, 96, 72)
@@ -56,11 +51,7 @@ def test_variants_are_evaluated_at_equal_times(
         assert all(judgment is not None and judgment.content > 0 for judgment in judgments)
         assert judgments[-1] == judge.judge(curve.sh_dc)
     assert (curves[0].points[-1].relative or 1) < 0.9  # it optimizes the loss it is evaluated with
-    write_plot(tmp_path / "p.png", curves, "a wall")
-    assert Image.open(tmp_path / "p.png").width > 800
-    values = json.loads(json.dumps(as_dict(curves)))
-    assert set(values["variants"]) == set(names)
-    assert values["pareto_front"]
+    assert json.loads(json.dumps(as_dict(curves)))["pareto_front"]
 
 
 def test_pareto_front_contains_undominated_points() -> None:
@@ -78,11 +69,6 @@ def test_initial_loss_of_zero_has_no_ratio(tmp_path: Path) -> None:
     assert point_line(curves[0]) == "standard: the initial loss was 0, after 2.0 s, 1 steps"
     assert error_time_table(curves).row_count == 1
     write_plot(tmp_path / "plot.png", curves, "black")
-
-
-def test_unknown_variant_error_names_it() -> None:
-    with pytest.raises(SettingsError, match="no variant slower"):
-        choose_variants(["standard", "slower"])
 
 
 @pytest.fixture(scope="module")
@@ -106,14 +92,10 @@ def test_variants_are_compared_with_scene_and_color_transfer(quality: Quality) -
         assert outcome.steps > 0
         assert outcome.judgment.content > 0
         assert outcome.short is not None
-    Console(file=(table := io.StringIO()), width=180).print(quality_table(quality))
     values = json.loads(json.dumps(quality.as_dict()))
     assert values["lpips"] == "vgg"
     assert values["outcomes"][2]["consistency"]["short"]["rmse"] > 0
-    assert f"{values['outcomes'][2]['consistency']['short']['lpips']:.3f}" in table.getvalue()
-    assert values["views"]
-    last = values["error_time"]["variants"]["standard"]["points"][-1]
-    assert last["relative"] == variants[0].loss
+    assert values["error_time"]["variants"]["standard"]["points"][-1]["relative"] == variants[0].loss
 
 
 def test_consistency_is_measured_with_vgg(quality: Quality, tiny_weights: BackboneWeights) -> None:

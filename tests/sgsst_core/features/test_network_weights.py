@@ -102,13 +102,6 @@ def vgg19_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def vgg16_folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
-    """Return a cache folder with a copy of the real VGG16 weights, which a test may damage."""
-    shutil.copy(cache_folder() / "vgg16.safetensors", tmp_path)
-    return tmp_path
-
-
 @pytest.mark.slow
 def test_both_weight_conventions_give_the_same_features(vgg19_folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "vgg_conv.pth"
@@ -162,10 +155,10 @@ def test_other_channel_counts_are_preserved(tiny_weights: BackboneWeights, tiny_
         assert features["relu5_1"].shape == (pixels // 16, pixels // 16, 16)
 
 
-def test_auto_prefers_vgg19(vgg19_folder: Path, vgg16_folder: Path) -> None:
-    assert load_network_weights("auto", vgg16_folder).name == "vgg16"
-    shutil.copy(vgg19_folder / "vgg19.safetensors", vgg16_folder)
-    assert load_network_weights("auto", vgg16_folder).name == "vgg19"
+def test_auto_prefers_vgg19(vgg19_folder: Path, folder: Path) -> None:
+    assert load_network_weights("auto", folder).name == "vgg16"
+    shutil.copy(vgg19_folder / "vgg19.safetensors", folder)
+    assert load_network_weights("auto", folder).name == "vgg19"
 
 
 def test_vgg16_has_published_weights_and_nonzero_features(vgg16_weights: BackboneWeights) -> None:
@@ -198,11 +191,11 @@ def test_unknown_names_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("remaining", [0, 7, 8, 5_000, 30_000_000, -1])
-def test_truncated_file_is_refused(remaining: int, vgg16_folder: Path) -> None:
-    file = vgg16_folder / "vgg16.safetensors"
+def test_truncated_file_is_refused(remaining: int, folder: Path) -> None:
+    file = folder / "vgg16.safetensors"
     file.write_bytes(file.read_bytes()[:remaining])
     with pytest.raises(WeightsError, match=r"vgg16\.safetensors.*sgsst weights fetch vgg16"):
-        load_network_weights("vgg16", vgg16_folder)
+        load_network_weights("vgg16", folder)
 
 
 def test_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
@@ -211,10 +204,10 @@ def test_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
         load_network_weights("vgg16", tmp_path)
 
 
-def test_file_of_another_network_is_refused(vgg16_folder: Path) -> None:
-    (vgg16_folder / "vgg16.safetensors").rename(vgg16_folder / "vgg19.safetensors")
+def test_file_of_another_network_is_refused(folder: Path) -> None:
+    (folder / "vgg16.safetensors").rename(folder / "vgg19.safetensors")
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg19"):
-        load_network_weights("vgg19", vgg16_folder)
+        load_network_weights("vgg19", folder)
 
 
 def test_wrong_state_dicts_are_refused(tmp_path: Path) -> None:
@@ -333,8 +326,9 @@ def test_cache_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytes
 
 @pytest.fixture
 def folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
-    """Return a folder with a copy of the package's smaller weight file, which a test may damage."""
-    shutil.copy(cache_folder() / "lpips_alex.safetensors", tmp_path)
+    """Return a folder with copies of the package's weight files, which a test may damage."""
+    for name in PACKAGE_FILES:
+        shutil.copy(cache_folder() / f"{name}.safetensors", tmp_path)
     return tmp_path
 
 

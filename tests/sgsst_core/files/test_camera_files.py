@@ -539,70 +539,70 @@ NAN = float("nan")
 MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("rotation", None, "has no 'rotation'"),
-        ("rotation", [[1, 0], [0, 1]], r"'rotation' has shape \(2, 2\), not \(3, 3\)"),
-        ("rotation", "right", "'rotation' is the text \"right\", not only numbers. Write it without quotes"),
-        (
-            "rotation",
-            [["1_0", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]],
-            "'rotation' holds the text \"1\", not only numbers",
-        ),
-        ("rotation", [[True, 0, 0], [0, 1, 0], [0, 0, 1]], "'rotation' holds true, not only numbers. Export"),
-        ("rotation", [[None, 0, 0], [0, 1, 0], [0, 0, 1]], "'rotation' holds null, not only numbers"),
-        ("position", {"x": 0}, "'position' is the object .*, not only numbers"),
-        ("position", [0, 0, "1_0"], "'position' holds the text \"1_0\", not only numbers"),
-        ("position", [[0], [0, 0], 0], "'position' is not an array of numbers"),
-        ("rotation", [[1, 0, 0], [0, 10**400, 0], [0, 0, 1]], "'rotation' is not an array of numbers"),
-        ("rotation", (2 * np.eye(3)).tolist(), "is 3 off a rotation"),
-        ("rotation", [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]], "is 0.01 off a rotation"),
-        ("rotation", MIRROR.tolist(), "mirrors"),
-        ("rotation", np.full((3, 3), NAN).tolist(), "holds NaN"),
-        ("position", [0, math.inf, 0], "holds NaN or infinite"),
-        ("position", [0, 1], r"shape \(2,\)"),
-        ("width", 0, "width is 0"),
-        ("height", -4, "height is -4"),
-        ("height", 99.5, "whole pixels"),
-        ("height", None, "has no 'height'"),
-        ("fx", 0, "focal length x is 0"),
-        ("fy", -1.0, "focal length y is -1"),
-        ("fx", NAN, "'fx' is nan, not a finite number"),
-        ("fx", 10**400, "not a finite number"),
-        ("fx", True, "'fx' is true, not a number. Export"),
-        ("fx", "500", "'fx' is the text \"500\", not a number. Write it without quotes"),
-        ("width", "640", "'width' is the text \"640\", not a number"),
-        ("cx", [320], "'cx' is the list .320., not a number"),
-    ],
-)
-def test_wrong_values_of_inria_cameras_are_named(tmp_path: Path, key: str, value: Any, message: str) -> None:
-    path = save(tmp_path / "cameras.json", change(inria(views()), key, value))
-    with pytest.raises(CameraError, match=rf"cameras\.json: camera 1 \('img_1\.png'\): .*{message}"):
-        read_cameras(path)
+#: Keys of the second camera, values (None to remove the key), and messages.
+WRONG_INRIA: list[tuple[str, Any, str]] = [
+    ("rotation", None, "has no 'rotation'"),
+    ("rotation", [[1, 0], [0, 1]], r"'rotation' has shape \(2, 2\), not \(3, 3\)"),
+    ("rotation", "right", "'rotation' is the text \"right\", not only numbers. Write it without quotes"),
+    (
+        "rotation",
+        [["1_0", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]],
+        "'rotation' holds the text \"1\", not only numbers",
+    ),
+    ("rotation", [[True, 0, 0], [0, 1, 0], [0, 0, 1]], "'rotation' holds true, not only numbers. Export"),
+    ("rotation", [[None, 0, 0], [0, 1, 0], [0, 0, 1]], "'rotation' holds null, not only numbers"),
+    ("position", {"x": 0}, "'position' is the object .*, not only numbers"),
+    ("position", [0, 0, "1_0"], "'position' holds the text \"1_0\", not only numbers"),
+    ("position", [[0], [0, 0], 0], "'position' is not an array of numbers"),
+    ("rotation", [[1, 0, 0], [0, 10**400, 0], [0, 0, 1]], "'rotation' is not an array of numbers"),
+    ("rotation", (2 * np.eye(3)).tolist(), "is 3 off a rotation"),
+    ("rotation", [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]], "is 0.01 off a rotation"),
+    ("rotation", MIRROR.tolist(), "mirrors"),
+    ("rotation", np.full((3, 3), NAN).tolist(), "holds NaN"),
+    ("position", [0, math.inf, 0], "holds NaN or infinite"),
+    ("position", [0, 1], r"shape \(2,\)"),
+    ("width", 0, "width is 0"),
+    ("height", -4, "height is -4"),
+    ("height", 99.5, "whole pixels"),
+    ("height", None, "has no 'height'"),
+    ("fx", 0, "focal length x is 0"),
+    ("fy", -1.0, "focal length y is -1"),
+    ("fx", NAN, "'fx' is nan, not a finite number"),
+    ("fx", 10**400, "not a finite number"),
+    ("fx", True, "'fx' is true, not a number. Export"),
+    ("fx", "500", "'fx' is the text \"500\", not a number. Write it without quotes"),
+    ("width", "640", "'width' is the text \"640\", not a number"),
+    ("cx", [320], "'cx' is the list .320., not a number"),
+]
+WRONG_NERFSTUDIO: list[tuple[str, Any, str]] = [
+    ("transform_matrix", None, "has no 'transform_matrix'"),
+    ("transform_matrix", np.eye(3).tolist(), r"shape \(3, 3\), not \(4, 4\) or \(3, 4\)"),
+    ("transform_matrix", (3 * np.eye(4)).tolist(), "is 8 off a rotation"),
+    ("k1", NAN, "'k1' is nan, not a finite number"),
+    ("p2", "0.1", "'p2' is the text \"0.1\", not a number"),
+    ("h", "480", "'h' is the text \"480\", not a number"),
+    ("fl_y", {}, "'fl_y' is the object {}, not a number"),
+    ("camera_model", 3, "'camera_model' is 3, not a name"),
+    ("is_fisheye", "false", "'is_fisheye' is the text \"false\", not true or false"),
+    ("camera_model", "ORTHOPHOTO", "ORTHOPHOTO, which is neither a pinhole .*EQUIRECTANGULAR"),
+    ("camera_model", "VR180_L", "VR180_L, which is neither a pinhole"),
+    ("w", -1, "width is -1"),
+    ("cx", NAN, "'cx' is nan"),
+]
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    ("make", "name", "key", "value", "message"),
     [
-        ("transform_matrix", None, "has no 'transform_matrix'"),
-        ("transform_matrix", np.eye(3).tolist(), r"shape \(3, 3\), not \(4, 4\) or \(3, 4\)"),
-        ("transform_matrix", (3 * np.eye(4)).tolist(), "is 8 off a rotation"),
-        ("k1", NAN, "'k1' is nan, not a finite number"),
-        ("p2", "0.1", "'p2' is the text \"0.1\", not a number"),
-        ("h", "480", "'h' is the text \"480\", not a number"),
-        ("fl_y", {}, "'fl_y' is the object {}, not a number"),
-        ("camera_model", 3, "'camera_model' is 3, not a name"),
-        ("is_fisheye", "false", "'is_fisheye' is the text \"false\", not true or false"),
-        ("camera_model", "ORTHOPHOTO", "ORTHOPHOTO, which is neither a pinhole .*EQUIRECTANGULAR"),
-        ("camera_model", "VR180_L", "VR180_L, which is neither a pinhole"),
-        ("w", -1, "width is -1"),
-        ("cx", NAN, "'cx' is nan"),
+        *((inria, "img_1", *wrong) for wrong in WRONG_INRIA),
+        *((nerfstudio, "images/img_1", *wrong) for wrong in WRONG_NERFSTUDIO),
     ],
 )
-def test_wrong_values_of_nerfstudio_cameras_are_named(tmp_path: Path, key: str, value: Any, message: str) -> None:
-    path = save(tmp_path / "transforms.json", change(nerfstudio(views()), key, value))
-    with pytest.raises(CameraError, match=rf"transforms\.json: camera 1 \('images/img_1\.png'\): .*{message}"):
+def test_wrong_values_of_cameras_are_named(
+    tmp_path: Path, make: Callable[[list[Camera]], Any], name: str, key: str, value: Any, message: str
+) -> None:
+    path = save(tmp_path / "cameras.json", change(make(views()), key, value))
+    with pytest.raises(CameraError, match=rf"cameras\.json: camera 1 \('{name}\.png'\): .*{message}"):
         read_cameras(path)
 
 

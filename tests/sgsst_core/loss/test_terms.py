@@ -38,7 +38,7 @@ from sgsst_core.loss.terms import (
 )
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.scales import ScaleWeights
-from sgsst_core.settings import StyleLossName, make_settings
+from sgsst_core.settings import StyleLossName
 from sgsst_core.style import Style, chosen_positions
 from tests.networks import tiny_weights as make_tiny_weights
 from tests.sgsst_core.synthetic_images import nearly_one_color, relative_error, synthetic_image
@@ -352,8 +352,3 @@ def test_even_scales_differ_only_in_the_color_layers(renormalized: BackboneWeigh
 def test_papers_network_is_returned_unchanged(tiny_weights: BackboneWeights) -> None:
     assert at_scale(tiny_weights, "paper") is tiny_weights
     assert at_scale(tiny_weights, "even") is tiny_weights
-
-
-def test_paper_preset_uses_the_paper_scale() -> None:
-    assert make_settings("paper").feature_scale == "paper"
-    assert make_settings("standard").feature_scale == make_settings("preview").feature_scale == "even"

@@ -247,7 +247,7 @@ def test_counts_are_those_of_the_reference(tmp_path: Path) -> None:
     scene = replace(cloud(2000, log_scale=-3.0), opacities=torch.linspace(-2, 4, 2000))
     small = opaque = 0
     for view in VIEWS:
-        visible = set(visible_in(scene, view))
+        visible = set(project(scene, view).gaussians.tolist())
         plain, after = splat(scene, view), splat(replace(scene, rendering=AA), view)
         left = dict(zip(after.gaussians.tolist(), after.opacity.tolist(), strict=True))
         for index, opacity in zip(plain.gaussians.tolist(), plain.opacity.tolist(), strict=True):
@@ -259,7 +259,3 @@ def test_counts_are_those_of_the_reference(tmp_path: Path) -> None:
     # The projection leaves out small ones between pixel centers, which the reference keeps.
     assert counts[1] == pytest.approx(opaque / 2, abs=1)
     assert counts[0] == pytest.approx(small / 2, rel=0.02)
-
-
-def visible_in(scene: Scene, view: Camera) -> list[int]:
-    return project(scene, view).gaussians.tolist()

@@ -121,18 +121,6 @@ def test_midpoint_halves_shortest_rotation_and_translation(first: float, second:
     assert midpoint.world_to_camera[3].tolist() == [0, 0, 0, 1]
 
 
-def test_midpoints_of_opposite_and_of_equal_cameras_are_valid():
-    ends = posed(rotation(0.0), (0, 0, 0)), posed(rotation(math.pi), (2, 0, 0))
-    midpoint = between(*ends)
-    assert [angle_between(midpoint, end) for end in ends] == pytest.approx([math.pi / 2] * 2, abs=1e-7)
-    orientation = midpoint.world_to_camera[:3, :3]
-    torch.testing.assert_close(orientation @ orientation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
-    assert float(torch.linalg.det(orientation)) == pytest.approx(1)
-    assert midpoint.center.tolist() == pytest.approx([1, 0, 0])
-    same = posed(rotation(2.0), (0.3, 0.2, 0.1))
-    torch.testing.assert_close(between(same, same).world_to_camera, same.world_to_camera, rtol=0, atol=1e-14)
-
-
 def test_one_novel_camera_lies_between_neighbors():
     row = cameras(5)
     assert names(cameras_between(row, range(5))) == [f"view_{i}–view_{i + 1}" for i in range(4)]

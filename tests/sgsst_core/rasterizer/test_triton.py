@@ -129,10 +129,8 @@ def test_tile_intersections_equal_those_of_the_cpu(case: tuple[Scene, Camera]) -
     scene, view = case
     isects, expected = on_device(scene).intersections(view), build_tile_intersections(scene, view)
     assert np.array_equal(isects.gaussians.cpu().numpy(), expected.projection.gaussians)
-    assert np.array_equal(isects.first_slots.cpu().numpy(), expected.first_slots)
-    assert np.array_equal(isects.starts.cpu().numpy(), expected.starts)
-    assert np.array_equal(isects.ranks.cpu().numpy(), expected.ranks)
-    assert np.array_equal(isects.slots.cpu().numpy(), expected.slots)
+    for name in ("first_slots", "starts", "ranks", "slots"):
+        assert np.array_equal(getattr(isects, name).cpu().numpy(), getattr(expected, name)), name
     assert np.allclose(isects.values.cpu().numpy(), expected.projection.values, rtol=1e-9, atol=1e-9)
 
 

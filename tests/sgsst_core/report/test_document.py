@@ -23,6 +23,7 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import Stopped, run
 from sgsst_core.stylizing.steps import Evaluation, StepRecord, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.report.test_page import parsed
 from tests.small_scenes import ball, blind_camera, cameras, style
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -69,6 +70,9 @@ def test_report_describes_the_job(finished: tuple[Stylizer, Evaluation, Evaluati
     assert report["settings"] == stylizer.job.settings.model_dump(mode="json")
     assert report["memory"]["peak_bytes"] > 50_000_000
     assert report["memory"]["device_peak_bytes"] is report["plan"]["measured"]["device_bytes"] is None
+    page = parsed(json.loads(json.dumps(report)))
+    assert "scene.ply in the style of style.png" in page.text
+    assert {decision["reason"] for decision in report["plan"]["decisions"]} <= set(page.cells)
     parts = sum(report["seconds_by_part"].values())
     assert 0.2 * report["seconds"] < parts <= report["seconds"] + 0.01
 
@@ -80,6 +84,7 @@ def test_report_has_the_losses_of_the_steps(
     report = build_report(stylizer, sources, "within", before, after)
     assert report["stopped"] == "within"
     assert [entry["step"] for entry in report["history"]] == list(range(1, 8))
+    assert 3 not in {entry["view"] for entry in report["history"]}, "the view that sees nothing is skipped"
     for entry, record in zip(report["history"], stylizer.history, strict=True):
         terms = entry["scales"]["0"]
         assert entry["loss"] == record.loss

@@ -1,7 +1,6 @@
 import base64
 import functools
 import io
-import json
 import math
 import os
 import re
@@ -15,17 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image, ImageColor
 
-from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.report.charts import BINS, running_mean, thinned, write_loss_chart
-from sgsst_core.report.document import Sources, build_report
 from sgsst_core.report.images import COLORS, INK, ON_DARK
 from sgsst_core.report.page import render_page, write_page
 from sgsst_core.scales import smoothed
-from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.report.sample import sample_report
-from tests.small_scenes import ball, cameras, style
 
 #: Warning of matplotlib if it cannot lay out a figure.
 pytestmark = pytest.mark.filterwarnings("error")
@@ -302,24 +295,6 @@ def test_extreme_losses_are_shown(size: float) -> None:
         for terms in record["scales"].values():
             terms.update(dict.fromkeys(terms, size))
     parsed(report)
-
-
-def test_page_of_a_real_job_is_self_contained(tiny_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:
-    stylizer = Stylizer.planned(
-        ball(), cameras(3), style(), make_settings(steps_sos=4, learning_rate=0.3), weights=tiny_weights
-    )
-    before = stylizer.evaluate(stylizer.job.evaluation_views)
-    stopped = run(stylizer)
-    sources = Sources(tmp_path / "ball.ply", 0, (Path("style.png"),), Path("cameras.json"), None, tiny_weights)
-    after = stylizer.evaluate(stylizer.job.evaluation_views)
-    report = json.loads(json.dumps(build_report(stylizer, sources, stopped, before, after)))
-    (tmp_path / "sheet.jpg").write_bytes(sample_sheet())
-    write_page(tmp_path / "report.html", report, tmp_path / "sheet.jpg")
-    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
-    page.assert_self_contained()
-    assert "ball.ply in the style of style.png" in page.text
-    assert {decision["reason"] for decision in report["plan"]["decisions"]} <= set(page.cells)
-    assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"][:2] == ["loss", "split"]
 
 
 def colors_in(path: Path) -> set[tuple[int, ...]]:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.planning.plan import Plan
 from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings, make_settings
@@ -222,10 +221,6 @@ def settings_of(**values: Any) -> Settings:
     return make_settings(**{"style_loss": "nnfm", "steps_sos": 6, "early_stop": False, **values})
 
 
-def plan_mentions_transfer(plan: Plan) -> bool:
-    return any("after the last step" in line.decision for line in plan.decisions)
-
-
 def test_transfer_changes_results_but_not_optimized_colors(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights)
     run(stylizer)
@@ -239,7 +234,7 @@ def test_transfer_changes_results_but_not_optimized_colors(tiny_weights: Backbon
     assert float((wanted - optimized).abs().mean()) > 0.01
     assert torch.equal(stylizer.sh_dc, optimized)
     assert torch.equal(stylizer.shown(), stylized[stylizer.job.plan.seen])
-    assert plan_mentions_transfer(stylizer.job.plan)
+    assert any("after the last step" in line.decision for line in stylizer.job.plan.decisions)
 
 
 def test_regions_get_colors_of_their_styles_and_frozen_ones_none(tiny_weights: BackboneWeights) -> None:

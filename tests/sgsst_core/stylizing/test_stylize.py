@@ -17,7 +17,6 @@ from sgsst_core.errors import CameraError, ImageError, SceneError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import as_scene
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.progress import Progress
 from sgsst_core.quality.measure import Float32Reference
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene
@@ -187,13 +186,6 @@ def test_progress_is_shown_on_a_terminal_only_on_request(
     run(wall(), tiny_weights, callbacks=callbacks, progress=True)
     assert "2/2" in capsys.readouterr().out
     assert steps == [1, 2, 1, 2]
-
-
-def test_planning_reports_its_progress(tiny_weights: BackboneWeights) -> None:
-    surveyed: list[Progress] = []
-    settings = make_settings("preview", steps_sos=1)
-    Stylizer.planned(wall(), cameras(3), style(), settings, weights=tiny_weights, show=surveyed.append)
-    assert [(each.stage, each.step, each.total) for each in surveyed] == [("planning", done, 3) for done in range(4)]
 
 
 def test_importing_the_package_imports_no_pytorch() -> None:

