@@ -1,4 +1,4 @@
-"""Tests on GPUs: several ranks with NCCL against one rank, and one GPU against the CPU."""
+"""Tests of ranks on GPUs: with NCCL against one rank, a GPU against the CPU, and steps on simulated GPUs over gloo."""
 
 from datetime import timedelta
 from pathlib import Path
@@ -13,12 +13,13 @@ from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.networks import tiny_weights
 from tests.ports import free_port
+from tests.pretend_cuda.device import counts
 from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import ball, cameras, style, wall
+from tests.worker.ranks.spawn import on_ranks
 from worker.ranks.process_group import process_group
-
-pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("vgg16_weights")]
 
 
 def gradient(collectives: Collectives, name: str) -> Tensor:
@@ -46,6 +47,8 @@ def run_rank(rank: int, size: int, address: str, name: str, folder: str) -> None
         torch.save(gradient(collectives, name), Path(folder) / f"{rank}.pt")
 
 
+@pytest.mark.gpu
+@pytest.mark.usefixtures("vgg16_weights")
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA GPUs")
 @pytest.mark.parametrize("name", ["wall", "ball"])
 def test_nccl_gradient_matches_one_rank(name: str, tmp_path: Path, exact_convolutions: None) -> None:
@@ -61,6 +64,8 @@ def test_nccl_gradient_matches_one_rank(name: str, tmp_path: Path, exact_convolu
     assert relative_error(actual[0], expected) < 1e-5
 
 
+@pytest.mark.gpu
+@pytest.mark.usefixtures("vgg16_weights")
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU that PyTorch can use")
 @pytest.mark.parametrize("name", ["wall", "ball"])
 def test_gpu_gradient_matches_cpu(name: str, exact_convolutions: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,3 +74,35 @@ def test_gpu_gradient_matches_cpu(name: str, exact_convolutions: None, monkeypat
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     on_cpu = gradient(ALONE, name)
     assert relative_error(on_gpu, on_cpu) < 1e-3
+
+
+STEPS = 4
+
+
+def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int], str]:
+    """Run a few steps of one view at two scales; return colors, losses, synchronizations, and device and rasterizer."""
+    settings = make_settings(steps_coarse=0, steps_sos=STEPS, coarsest_side=16, precision="float32")
+    stylizer = Stylizer.planned(
+        ball(60), cameras(1, 48, 32), style(), settings, weights=tiny_weights(), collectives=collectives
+    )
+    losses, waits = [], []
+    for _ in range(STEPS):
+        counts.clear()
+        losses.append(stylizer.run_step().loss)
+        waits.append(counts.waits.total())
+    return stylizer.stylized(), losses, waits, f"{stylizer.job.plan.device} {stylizer.job.plan.uncached}"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU, on which the tests marked gpu run")
+def test_two_ranks_match_one_and_synchronize_once_per_step() -> None:
+    """Communication is not counted as host synchronization, because the library waits for other ranks anyway."""
+    pytest.importorskip("triton")
+    expected, losses, _, _ = run_steps(ALONE)
+    first, second = on_ranks(2, run_steps, device="cuda")
+    assert first[2][2:] == second[2][2:] == [1] * (STEPS - 2)
+    assert torch.equal(first[0], second[0])
+    assert first[1] == second[1]
+    assert first[3] == second[3] == "cuda triton"
+    assert first[1] == pytest.approx(losses, rel=1e-4)
+    assert relative_error(first[0], expected.double()) < 1e-3
