@@ -115,8 +115,7 @@ def test_steady_step_synchronizes_once_and_copies_scalars(
     """The first step of a view has one more wait, because it builds the tile intersections."""
     settings: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 4, "position_weights": "on" if scan else "off"}
     stylizer = prepare(request_(tmp_path, scan=scan, gray=gray, size=(64, 48), **settings)).stylizer
-    assert len(stylizer.job.scales(0)) == 3
-    assert stylizer.job.plan.weighted == scan
+    assert (len(stylizer.job.scales(0)), stylizer.job.plan.weighted) == (3, scan)
     seen: set[int] = set()
     for _ in range(stylizer.job.total_steps):
         counts.clear()
@@ -202,8 +201,7 @@ def test_losses_match_cpu(tmp_path: Path, regions: bool) -> None:
         stylizer = prepare(asked).stylizer
         for _ in range(expected.job.total_steps):
             theirs, ours = expected.run_step(), stylizer.run_step()
-            assert ours.view == theirs.view
-            assert ours.loss == pytest.approx(theirs.loss, rel=2e-4)
+            assert (ours.view, ours.loss) == (theirs.view, pytest.approx(theirs.loss, rel=2e-4))
     assert stylizer.job.plan.device == "cuda"
     assert expected.job.plan.device == "cpu"
 

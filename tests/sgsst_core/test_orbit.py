@@ -49,8 +49,7 @@ def test_extent_of_a_box_includes_the_extents_of_its_gaussians() -> None:
     corner = torch.tensor([0.5, 1.5, 0.3], dtype=torch.float64) + reach
     assert torch.allclose(extent(OBJECT), torch.stack([-corner, corner]), atol=0.01)
     subject = find_subject(OBJECT)
-    assert subject.left_out == pytest.approx(0, abs=1e-9)
-    assert float(subject.weights.sum()) == pytest.approx(1)
+    assert (subject.left_out, float(subject.weights.sum())) == (pytest.approx(0, abs=1e-9), pytest.approx(1))
     assert bool(subject.holds(OBJECT.means).all())
     assert not bool(subject.holds(torch.tensor([[0.0, 1.6, 0.0]])).any())
 
@@ -237,8 +236,7 @@ def test_panel_may_stand_or_lie(normal: int, candidates: list[str]) -> None:
     points = box((-3, -1, -3), (3, -0.9, 3)).roll(normal - 1, 1)
     up = up_of(scene_of(points))
     assert not up.sure
-    assert [each.removeprefix("-") for each in up.candidates] == candidates
-    assert up.name == "-y"
+    assert ([each.removeprefix("-") for each in up.candidates], up.name) == (candidates, "-y")
 
 
 @pytest.mark.parametrize(("along", "name"), [(0, "x"), (1, "-y"), (2, "z")])
@@ -330,10 +328,8 @@ def test_frames_have_a_margin_around_the_object() -> None:
 
 
 def test_cameras_are_distributed_over_rings_by_circumference() -> None:
-    assert cameras_per_ring(24, [10.0]) == [24]
-    assert cameras_per_ring(24, [0.0, 60.0]) == [16, 8]
-    assert cameras_per_ring(2, [0.0, 40.0, 70.0]) == [1, 1, 0]
-    assert cameras_per_ring(5, [0.0, 80.0]) == [4, 1]
+    assert (cameras_per_ring(24, [10.0]), cameras_per_ring(24, [0.0, 60.0])) == ([24], [16, 8])
+    assert (cameras_per_ring(2, [0.0, 40.0, 70.0]), cameras_per_ring(5, [0.0, 80.0])) == ([1, 1, 0], [4, 1])
     middle, axis = middle_of(find_subject(figure()), torch.tensor(UP).double()), torch.tensor(UP, dtype=torch.float64)
     views = orbit(figure(), 24, up=UP, elevations=[10.0, 40.0, -20.0])
     counts = cameras_per_ring(24, [10.0, 40.0, -20.0])
@@ -472,8 +468,7 @@ def test_scene_with_ground_gets_views_from_above_and_none_from_below() -> None:
 def test_pole_gets_no_views_from_above() -> None:
     pole = scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01)
     orbit = make_orbit(pole, OrbitRequest(count=24))
-    assert max(orbit.elevations) == 10
-    assert max(orbit.tried) == 70
+    assert (max(orbit.elevations), max(orbit.tried)) == (10, 70)
     assert orbit.next is not None
     assert orbit.next < 0.03
 
@@ -489,15 +484,13 @@ def test_automatic_view_count_is_bounded_and_grows_with_the_rings() -> None:
 @pytest.mark.parametrize("count", [1, 2, 5, 11])
 def test_few_views_form_one_ring(count: int) -> None:
     orbit = make_orbit(table(), OrbitRequest(count=count))
-    assert len(orbit.cameras) == count
-    assert orbit.elevations == (10,)
+    assert (len(orbit.cameras), orbit.elevations) == (count, (10,))
 
 
 def test_requested_properties_are_used() -> None:
     scene = figure()
     orbit = make_orbit(scene, OrbitRequest(count=14, up=(0.0, 0.0, 1.0), elevation=35.0, radius=6.5))
-    assert len(orbit.cameras) == 14
-    assert orbit.up.direction.tolist() == [0, 0, 1]
+    assert (len(orbit.cameras), orbit.up.direction.tolist()) == (14, [0, 0, 1])
     middle = middle_of(find_subject(scene), orbit.up.direction)
     angles = [elevation(camera, middle, orbit.up.direction) for camera in orbit.cameras]
     assert angles == pytest.approx([35.0] * 14)

@@ -45,8 +45,7 @@ def test_text_names_what_the_stage_counts(progress: Progress, fraction: float, t
     ],
 )
 def test_duration_is_in_seconds_minutes_or_hours(seconds: float | None, text: str) -> None:
-    assert duration(seconds, " ") == text
-    assert duration(seconds) == text.replace(" ", "\u00a0")
+    assert (duration(seconds, " "), duration(seconds)) == (text, text.replace(" ", "\u00a0"))
 
 
 def shown(*, terminal: bool) -> str:

@@ -230,8 +230,7 @@ def test_content_weight_of_each_gaussian() -> None:
     labels = regions.labels.bool()
     weights = regions.content_weights(1.0)
     assert weights is not None
-    assert weights[labels].unique().tolist() == [1e4]
-    assert weights[~labels].unique().tolist() == [3.0]
+    assert (weights[labels].unique().tolist(), weights[~labels].unique().tolist()) == ([1e4], [3.0])
     assert protected(content_weight=None).content_weights(1.0) is None
     assert protected(content_weight=7.0).content_weights(7.0) is None
     empty = replace(protected(), labels=torch.zeros_like(regions.labels))
@@ -318,8 +317,7 @@ def test_array_selects_its_rows(tmp_path: Path, file: SceneFile, kind: type) -> 
 def test_lowest_bit_of_a_byte_is_its_first_gaussian(tmp_path: Path, file: SceneFile) -> None:
     (tmp_path / "m.BIN").write_bytes(bytes([0b00000011, 0b10000000, 0b00001000]))
     mask = read_mask(tmp_path / "m.BIN", file)
-    assert mask.dtype == torch.bool
-    assert mask.nonzero().flatten().tolist() == [0, 1, 15, 19]
+    assert (mask.dtype, mask.nonzero().flatten().tolist()) == (torch.bool, [0, 1, 15, 19])
 
 
 @pytest.mark.parametrize("name", ["m.bin", "m.npy"])

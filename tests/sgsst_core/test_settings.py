@@ -9,8 +9,7 @@ def test_paper_is_the_published_schedule() -> None:
     assert (settings.feature_scale, make_settings("standard").feature_scale) == ("paper", "even")
     assert (settings.steps_coarse, settings.steps_sos) == (10_000, 10_000)
     assert settings.learning_rate == settings.learning_rate_end == 2.5e-3
-    assert settings.content_weight == 1
-    assert settings.position_weights == "off"
+    assert (settings.content_weight, settings.position_weights) == (1, "off")
     assert settings.max_resolution is None
     assert settings.unseen == "freeze"
     assert not (settings.clamp_aware_gradient)
@@ -21,8 +20,7 @@ def test_paper_is_the_published_schedule() -> None:
 
 def test_values_override_the_preset_unless_none() -> None:
     settings = make_settings("preview", steps_sos=7, seed=None, max_resolution=None)
-    assert settings.steps_sos == 7
-    assert settings.steps_coarse == make_settings("preview").steps_coarse
+    assert (settings.steps_sos, settings.steps_coarse) == (7, make_settings("preview").steps_coarse)
     assert settings.max_resolution == 640
 
 
@@ -56,8 +54,7 @@ def test_strength_names_are_content_weights() -> None:
     weights = [
         make_settings("standard", content_weight=word).content_weight for word in ("strong", "balanced", "light")
     ]
-    assert weights == sorted(weights)
-    assert weights[0] == make_settings("standard").content_weight
+    assert (weights, weights[0]) == (sorted(weights), make_settings("standard").content_weight)
     schema = Settings.model_json_schema()["properties"]["content_weight"]
     assert {"number", "string"} == {kind["type"] for kind in schema["anyOf"]}
 

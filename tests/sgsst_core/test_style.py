@@ -77,8 +77,7 @@ def test_invalid_weights_are_refused(weights):
 
 def test_weights_of_any_size_are_normalized():
     assert normalized([1e308, 1e308]) == (0.5, 0.5)
-    assert normalized([1e-300, 3e-300]) == pytest.approx((0.25, 0.75))
-    assert normalized([0.3]) == (1.0,)
+    assert (normalized([1e-300, 3e-300]), normalized([0.3])) == (pytest.approx((0.25, 0.75)), (1.0,))
 
 
 def test_mixture_has_the_color_moments_of_its_images():

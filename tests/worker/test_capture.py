@@ -68,8 +68,7 @@ def test_cameras_without_distortion_and_photos_need_no_line(tmp_path: Path) -> N
     photos = write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2"])
     assert lines(capture.with_photos(photos)) == []
     half = read_capture(request(tmp_path, resolution=32), SCENE).with_photos(photos)
-    assert lines(half) == []
-    assert half.cameras[0].width == 32
+    assert (lines(half), half.cameras[0].width) == ([], 32)
 
 
 def test_photos_mostly_without_cameras_or_with_several_are_reported(tmp_path: Path) -> None:

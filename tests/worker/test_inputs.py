@@ -185,8 +185,7 @@ def test_one_rank_reads_and_shares_the_scene(tmp_path: Path, drop: bool) -> None
     write_scene(tmp_path / "scene.ply", scene)
     results = on_ranks(3, shared, tmp_path / "scene.ply", drop)
     alone = digest(read_scene(tmp_path / "scene.ply", drop_invalid=drop).scene)
-    assert [rank[0] for rank in results] == [alone] * 3
-    assert [rank[1] for rank in results] == [True, False, False]
+    assert ([rank[0] for rank in results], [rank[1] for rank in results]) == ([alone] * 3, [True, False, False])
     assert [rank[2] for rank in results] == [int(drop)] * 3
     assert all(rank[3] >= 1 for rank in results), "not mapped"
     assert [rank[4] for rank in results] == [0, 0, 0], "left behind"

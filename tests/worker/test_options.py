@@ -49,8 +49,7 @@ def test_long_names_are_read_in_linear_time() -> None:
 def test_existing_file_with_colon_takes_precedence(tmp_path: Path) -> None:
     odd = tmp_path / "poster:2"
     odd.touch()
-    assert parse_style(str(odd)) == StyleFile(odd)
-    assert parse_style(f"{odd}:3") == StyleFile(odd, 3.0)
+    assert (parse_style(str(odd)), parse_style(f"{odd}:3")) == (StyleFile(odd), StyleFile(odd, 3.0))
 
 
 @pytest.mark.parametrize("weight", ["0", "-1", "1e999"])

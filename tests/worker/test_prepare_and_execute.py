@@ -91,8 +91,7 @@ def test_planning_is_shown_and_resume_reuses_the_plan(request_: JobSpec, tmp_pat
     second = prepare(request_, resume=Resume(True), show_planning=planned.append)
     assert not planned, "nothing is surveyed again"
     assert second.resumed is not None
-    assert second.resumed.state.step == 3
-    assert second.stylizer.job.plan == second.resumed.plan
+    assert (second.resumed.state.step, second.stylizer.job.plan) == (3, second.resumed.plan)
     assert second.stylizer.job.plan.decisions == first.stylizer.job.plan.decisions
     assert run_job(second).stopped == "finished"
     assert request_.out.read_bytes() == whole.out.read_bytes()
@@ -215,8 +214,7 @@ def test_job_reuses_the_plan_of_its_dry_run(tmp_path: Path) -> None:
     shown: list[Progress] = []
     job = prepare(request, plan_file=tmp_path / "plan", show_planning=shown.append)
     assert shown == []
-    assert job.stylizer.job.plan.decisions == plan.decisions
-    assert run_job(job).stopped == "finished"
+    assert (job.stylizer.job.plan.decisions, run_job(job).stopped) == (plan.decisions, "finished")
     assert request.out.read_bytes() == whole.out.read_bytes()
 
 

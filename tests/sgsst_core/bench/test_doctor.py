@@ -35,8 +35,7 @@ def test_missing_weights_are_a_problem(
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "cache"))
     assert main(["doctor", "--json"]) == 1
     findings = json.loads(capsys.readouterr().out)
-    assert findings[0]["topic"] == "weights"
-    assert findings[0]["state"] == "problem"
+    assert (findings[0]["topic"], findings[0]["state"]) == ("weights", "problem")
     assert "sgsst weights fetch" in findings[0]["text"]
 
 
@@ -71,8 +70,7 @@ def test_hanging_or_crashed_examination_is_a_finding(monkeypatch: pytest.MonkeyP
     assert list(examine()) == [first, crashed]
     program.write_text(program.read_text().replace("exit 4", "exec sleep 100"))
     findings = list(examine(limit=1.0))
-    assert findings[0] == first
-    assert (findings[1].topic, findings[1].state) == ("time", "warning")
+    assert (findings[0], findings[1].topic, findings[1].state) == (first, "time", "warning")
 
 
 @pytest.mark.parametrize(

@@ -54,15 +54,13 @@ def test_tile_size_is_limited_even_if_more_pixels_fit():
 
 def test_covered_region_is_minimal_and_aligned():
     coverage = torch.zeros((100, 210))
-    assert covered_region(coverage).pixels == 0
-    assert partition(100, 210, None, 64, covered_region(coverage)) == []
+    assert (covered_region(coverage).pixels, partition(100, 210, None, 64, covered_region(coverage))) == (0, [])
     coverage[33, 50] = 1e-6
     coverage[60, 205] = 1
     region = covered_region(coverage)
     assert region == Rectangle(32, 48, 64, 208)
     (tile,) = partition(100, 210, None, 16, region)
-    assert tile.inner == region
-    assert tile.outer == Rectangle(16, 32, 80, 210)
+    assert (tile.inner, tile.outer) == (region, Rectangle(16, 32, 80, 210))
     tiles = partition(100, 210, 64, 16, region)
     assert sum(tile.inner.pixels for tile in tiles) == region.pixels
 

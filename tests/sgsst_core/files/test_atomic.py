@@ -18,8 +18,7 @@ def test_target_appears_only_when_complete(tmp_path: Path) -> None:
     with atomic_path(target) as temporary:
         temporary.write_bytes(b"new")
         assert not target.exists()
-        assert temporary.parent == tmp_path
-        assert temporary.suffix == ".ply"
+        assert (temporary.parent, temporary.suffix) == (tmp_path, ".ply")
     assert target.read_bytes() == b"new"
     assert os.listdir(tmp_path) == ["scene.ply"]
 
@@ -59,8 +58,7 @@ def test_new_file_gets_default_permissions_and_old_file_keeps_its_own(tmp_path: 
     target.chmod(0o640)
     with atomic_path(target) as temporary:
         temporary.write_text("2")
-    assert stat.S_IMODE(target.stat().st_mode) == 0o640
-    assert target.read_text() == "2"
+    assert (stat.S_IMODE(target.stat().st_mode), target.read_text()) == (0o640, "2")
 
 
 def test_symbolic_link_is_preserved(tmp_path: Path) -> None:
@@ -117,8 +115,7 @@ def test_file_that_cannot_replace_its_target_is_kept(tmp_path: Path, monkeypatch
     with pytest.raises(HeldOpenError, match=problem), atomic_path(target) as temporary:
         temporary.write_text("new")
     assert target.read_text() == "old"
-    assert (tmp_path / "scene.new.ply").read_text() == "new"
-    assert len(list(tmp_path.iterdir())) == 2
+    assert ((tmp_path / "scene.new.ply").read_text(), len(list(tmp_path.iterdir()))) == ("new", 2)
 
 
 def test_non_unicode_names_are_written_as_json(tmp_path: Path) -> None:

@@ -196,8 +196,7 @@ def regions(labels, **frozen):
 
 def test_regions_outside_all_views_join_the_rest():
     resolved = regions([0, 1, 2, 2]).resolved(torch.tensor([1.0, 0, 0, 2]))
-    assert resolved.labels.tolist() == [0, 0, 2, 2]
-    assert resolved.active == (0, 2)
+    assert (resolved.labels.tolist(), resolved.active) == ([0, 0, 2, 2], (0, 2))
     assert resolved.mapped
 
 

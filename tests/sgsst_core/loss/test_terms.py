@@ -200,8 +200,7 @@ def test_any_partition_agrees_with_untiled_autograd(
         weights, image, style, content, coverage=coverage, style_loss=style_loss, coarsest=60
     )
     result = evaluate(loss_of(weights, style_loss, tile_size=tile_size, coarsest=60), case)
-    assert result.scales == (0, 1)
-    assert result.loss == pytest.approx(expected, rel=1e-9)
+    assert (result.scales, result.loss) == ((0, 1), pytest.approx(expected, rel=1e-9))
     assert relative_error(gradient_of(result), gradient) < 1e-9
     assert all(terms["nearest"] > 0 for terms in result.terms.values())
     assert all((terms["gram"] > 0) == (style_loss == "mixed") for terms in result.terms.values())
@@ -262,8 +261,7 @@ def test_uncovered_positions_are_ignored(tiny_weights: BackboneWeights, style_lo
     coverage = torch.zeros((96, 64), dtype=torch.float64)
     loss = loss_of(tiny_weights, style_loss)
     nothing = evaluate(loss, (image, style, content, coverage))
-    assert nothing.loss == 0
-    assert gradient_of(nothing).abs().max() == 0
+    assert (nothing.loss, gradient_of(nothing).abs().max()) == (0, 0)
     coverage[:32] = 1
     other = image.clone()
     other[80:] = 0  # outside the receptive field of covered cells
@@ -340,8 +338,7 @@ def test_torchvision_vgg16_has_the_expected_scales(vgg16_weights: BackboneWeight
 
 def test_even_scales_differ_only_in_the_color_layers(renormalized: BackboneWeights) -> None:
     scaled = at_scale(renormalized, "even")
-    assert scaled.scales["relu1_1"] == EVEN_COLOR_SCALE
-    assert scaled.scales[PIXELS] == EVEN_PIXEL_SCALE
+    assert (scaled.scales["relu1_1"], scaled.scales[PIXELS]) == (EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE)
     assert {factor for layer, factor in scaled.scales.items() if layer not in ("relu1_1", PIXELS)} == {EVEN_SCALE}
     image = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(1))
     before, after = all_features(renormalized, image), all_features(scaled, image)

@@ -118,9 +118,7 @@ def test_agrees_with_plain_formulas_in_float64(alex: Lpips, scene: Scene) -> Non
 def test_unstylized_scene_has_no_content_difference(alex: Lpips) -> None:
     scene = ball()
     judgment = judged(judge_of(alex, scene, cameras(2)), scene.sh_dc)
-    assert judgment.content == 0
-    assert judgment.ssim == 1
-    assert judgment.features == 0
+    assert (judgment.content, judgment.ssim, judgment.features) == (0, 1, 0)
     assert judgment.background_sensitivity > 0  # an object has a background
 
 
@@ -289,8 +287,7 @@ def test_zero_for_equal_images_and_symmetric(vgg16_weights, network, dtype):
     lpips = network(dtype=dtype)
     first, second = synthetic_image(37, 50, seed=1), synthetic_image(37, 50, seed=2)
     same = lpips.distance(first, first)
-    assert same.mean == 0.0
-    assert same.map.shape == (37, 50)
+    assert (same.mean, same.map.shape) == (0.0, (37, 50))
     assert not same.map.any()
     forth, back = lpips.distance(first, second), lpips.distance(second, first)
     assert forth.mean > 0.01
@@ -301,8 +298,7 @@ def test_zero_for_equal_images_and_symmetric(vgg16_weights, network, dtype):
 def test_float32_agrees_with_float64(exact: Lpips | VggLpips):
     first, second = synthetic_image(45, 61, seed=3), synthetic_image(45, 61, seed=4)
     reference, result = exact.distance(first, second), type(exact)().distance(first, second)
-    assert result.map.dtype == torch.float32
-    assert result.mean == pytest.approx(reference.mean, rel=1e-5)
+    assert (result.map.dtype, result.mean) == (torch.float32, pytest.approx(reference.mean, rel=1e-5))
     torch.testing.assert_close(result.map.double(), reference.map, rtol=1e-4, atol=1e-6)
 
 

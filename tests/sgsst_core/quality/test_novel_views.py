@@ -480,8 +480,7 @@ def test_pairs_without_overlap_have_no_value(lpips):
     cameras = [camera((0, 0, 0)), behind, behind, other_side, camera((0.1, 0, 3 * DEPTH))]
     result = measure(scene, cameras, lpips=lpips)
     assert [pair.rmse is None for pair in result.pairs] == [True, True, True, False]
-    assert [pair.compared for pair in result.pairs[:3]] == [0, 0, 0]
-    assert result.rmse == result.pairs[3].rmse
+    assert ([pair.compared for pair in result.pairs[:3]], result.rmse) == ([0, 0, 0], result.pairs[3].rmse)
     assert result.lpips == result.pairs[3].lpips
     nothing = measure(scene, cameras[:2], lpips=lpips)
     assert (nothing.rmse, nothing.lpips, nothing.compared) == (None, None, 0.0)

@@ -59,10 +59,8 @@ def test_report_describes_the_job(finished: tuple[Stylizer, Evaluation, Evaluati
     assert report["graphs"] is None  # there are no graphs on a CPU
     assert report["steps"] == {"coarse": {"planned": 0, "done": 0}, "sos": {"planned": 7, "done": 7}}
     described = {"path": "a/scene.ply", "gaussians": 300, "sh_degree": 0, "dropped": 2, "refined": None}
-    assert report["scene"] == described
-    assert report["style"] == {"path": "style.png", "width": 80, "height": 96}
-    assert report["cameras"]["count"] == 6
-    assert report["cameras"]["sizes"] == [[64, 48]]
+    assert (report["scene"], report["style"]) == (described, {"path": "style.png", "width": 80, "height": 96})
+    assert (report["cameras"]["count"], report["cameras"]["sizes"]) == (6, [[64, 48]])
     assert report["cameras"]["seeing_nothing"] == ["blind"]
     assert report["position_weights"]["used"] is True
     assert 0.3 < report["position_weights"]["uncovered_fraction"] < 1
@@ -82,8 +80,7 @@ def test_report_has_the_losses_of_the_steps(
 ) -> None:
     stylizer, before, after = finished
     report = build_report(stylizer, sources, "within", before, after)
-    assert report["stopped"] == "within"
-    assert [entry["step"] for entry in report["history"]] == list(range(1, 8))
+    assert (report["stopped"], [entry["step"] for entry in report["history"]]) == ("within", list(range(1, 8)))
     assert 3 not in {entry["view"] for entry in report["history"]}, "the view that sees nothing is skipped"
     for entry, record in zip(report["history"], stylizer.history, strict=True):
         terms = entry["scales"]["0"]
@@ -198,8 +195,7 @@ def test_initial_loss_of_zero_has_no_ratio(finished: tuple[Stylizer, Evaluation,
     assert loss_text(mean_loss(nothing), mean_loss(after)).startswith(
         f"0 before, {mean_loss(after):.4g} after; it has risen"
     )
-    assert loss_text(0.0, 0.0) == "0 before, 0 after"
-    assert loss_text(4.0, 1.0) == "4 before, 1 after (25.0%)"
+    assert (loss_text(0.0, 0.0), loss_text(4.0, 1.0)) == ("0 before, 0 after", "4 before, 1 after (25.0%)")
     assert "(150.0%); it has risen" in loss_text(2.0, 3.0)
 
 

@@ -346,8 +346,7 @@ def test_thinning_keeps_range_and_mean() -> None:
     line = thinned(x, values, 25, math.log(2e4) / BINS)
     assert len(line.x) <= BINS + 1
     assert (np.diff(line.x) > 0).all()
-    assert line.low.min() == values.min()
-    assert line.high.max() == values.max()
+    assert (line.low.min(), line.high.max()) == (values.min(), values.max())
     assert ((line.low <= line.high) & (line.x >= 1) & (line.x <= 2e4)).all()
     places = np.floor(np.log(x) / (math.log(2e4) / BINS))
     smooth = running_mean(values, 25)

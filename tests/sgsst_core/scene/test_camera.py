@@ -266,8 +266,7 @@ def test_cameras_of_another_size_get_the_frame_of_most_cameras():
     small = posed((1, 0, 0), focal=50.0, size=(32, 24))
     path = CameraPath([posed((0, 0, 0)), small, posed((2, 0, 0))])
     frame = path.at(path.knots[1:2])[0]
-    assert (frame.width, frame.height, frame.cx, frame.cy) == (64, 48, 32, 24)
-    assert frame.fx == pytest.approx(100)
+    assert (frame.width, frame.height, frame.cx, frame.cy, frame.fx) == (64, 48, 32, 24, pytest.approx(100))
 
 
 def test_no_cameras_are_refused():
@@ -305,8 +304,7 @@ def ring(count):
 
 def test_order_of_the_file_is_kept_unless_it_jumps():
     cameras = ring(20)
-    assert in_path_order(cameras) == cameras
-    assert in_path_order(cameras[::-1]) == cameras[::-1]
+    assert (in_path_order(cameras), in_path_order(cameras[::-1])) == (cameras, cameras[::-1])
     shuffled = [cameras[(index * 7) % 20] for index in range(20)]
     assert [c.name for c in in_path_order(shuffled)] == [str(index) for index in range(20)]
 

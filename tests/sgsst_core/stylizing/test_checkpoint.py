@@ -156,8 +156,7 @@ def test_previous_checkpoint_replaces_an_unusable_one(full_checkpoint: Checkpoin
         Checkpoints(tmp_path / "other").save(full_checkpoint, "another job")
         (tmp_path / "other").replace(checkpoints.latest)
     warnings: list[str] = []
-    assert checkpoints.load("job", warnings.append).state.step == 2
-    assert len(warnings) == 1
+    assert (checkpoints.load("job", warnings.append).state.step, len(warnings)) == (2, 1)
     assert "of step 2" in warnings[0]
     with pytest.raises(CheckpointError, match="belongs to another job"):
         checkpoints.load("yet another", warnings.append) if spoil == "foreign" else load_checkpoint(

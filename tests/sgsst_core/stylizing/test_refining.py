@@ -137,8 +137,7 @@ def test_splits_that_would_change_the_image_are_undone(
     assert "are not split" in choice.refine_decision(refinement, settings(refine=4)).reason
     monkeypatch.setattr(refining, "MIN_PSNR", 0.0)
     loose = refinement_of(tiny_weights, 4.0)
-    assert loose.reverted == 0
-    assert loose.split == refinement.reverted
+    assert (loose.reverted, loose.split) == (0, refinement.reverted)
 
 
 def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> None:

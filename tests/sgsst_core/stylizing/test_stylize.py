@@ -102,8 +102,7 @@ def test_split_and_attenuated_results_have_the_form_of_the_scene(
         tolerance = 1e-5 if form == "activated" else 0  # exp and log round
         torch.testing.assert_close(actual, wanted, rtol=tolerance, atol=tolerance)
     if isinstance(given, dict):
-        assert len(result["label"]) == len(after)
-        assert set(result["label"]) == set(given["label"])
+        assert (len(result["label"]), set(result["label"])) == (len(after), set(given["label"]))
     else:
         save(tmp_path / "out.ply", result)
         saved = as_scene(load_scene(tmp_path / "out.ply"))
@@ -214,8 +213,7 @@ def test_job_is_bit_identical_to_that_of_an_attenuated_scene(tiny_weights: Backb
         run_job(each)
     assert torch.equal(stylizer.stylized(), other.stylized())
     assert [record.loss for record in stylizer.history] == [record.loss for record in other.history]
-    assert stylizer.job.scene.sh_degree == (0 if attenuation == 1 else 2)
-    assert stylizer.job.sh_degree == 2
+    assert (stylizer.job.scene.sh_degree, stylizer.job.sh_degree) == (0 if attenuation == 1 else 2, 2)
     exact = Float32Reference(stylizer).evaluate(stylizer.job.evaluation_views, stylizer.stylized())
     assert exact.keys() == stylizer.evaluate(stylizer.job.evaluation_views).keys()
     for scale, terms in stylizer.evaluate(stylizer.job.evaluation_views).items():

@@ -161,8 +161,7 @@ def test_phase_1_is_skipped_with_one_scale(
     tiny_weights: BackboneWeights, scene: Scene, preset: PresetName, phase_1: int
 ) -> None:
     stylizer = make(tiny_weights, scene, preset=preset)
-    assert stylizer.job.plan.steps_coarse == phase_1
-    assert stylizer.job.total_steps == phase_1 + 5
+    assert (stylizer.job.plan.steps_coarse, stylizer.job.total_steps) == (phase_1, phase_1 + 5)
 
 
 def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(tiny_weights: BackboneWeights) -> None:

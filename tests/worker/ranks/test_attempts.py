@@ -122,8 +122,7 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
     assert passed
     assert events.steps[-1] == ended.total == STEPS
     report = json.loads(request.out.with_name("s.report.json").read_text())
-    assert report["workers"]["used"] == 2
-    assert len(report["workers"]["ranks"]) == 2
+    assert (report["workers"]["used"], len(report["workers"]["ranks"])) == (2, 2)
     previews = list(request.out.with_name("previews").iterdir())
     assert previews
     for path in previews:
@@ -184,8 +183,7 @@ def test_job_survives_killed_raylet(undisturbed: tuple[float, bytes], cluster: C
     options = WorkerOptions(rank_timeout=5.0, checkpoint_seconds=0.2)
     ended = stylize_on_ranks(request, 2, replace(events.listener(), stop=stop), options=options, cluster=cluster)
     assert killed
-    assert len(ended.attempts) == 1
-    assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
+    assert (len(ended.attempts), loss_of(ended)) == (1, pytest.approx(undisturbed[0], rel=TOLERANCE))
 
 
 @pytest.mark.slow

@@ -153,8 +153,7 @@ def test_resumed_attempt_relays_no_preparation() -> None:
     assert (recorder.relay.first_step, recorder.relay.last_step) == (None, 4)
     again = RankStatus(prepared=Prepared([], 4, 10))
     assert recorder.after(again, replace(again, progress=step(5))) == [("resumed", None), ("sos", 5)]
-    assert recorder.relay.first_step == 4
-    assert recorder.relay.farthest == (5, 4)
+    assert (recorder.relay.first_step, recorder.relay.farthest) == (4, (5, 4))
 
 
 @pytest.mark.parametrize("again", [False, True])
@@ -174,8 +173,7 @@ GB = 1_000_000_000
 
 
 def test_scene_memory_is_its_decompressed_size() -> None:
-    assert scene_bytes("room.ply", GB) == GB
-    assert scene_bytes("ROOM.SPZ", 25_000_000) == 248_000_000
+    assert (scene_bytes("room.ply", GB), scene_bytes("ROOM.SPZ", 25_000_000)) == (GB, 248_000_000)
     assert scene_bytes("room.compressed.ply", 61_000_000) == 248_000_000
     assert memory_beside_gpus(4, 5 * GB) == 22 * GB, "ranks of a machine share the scene"
 

@@ -205,12 +205,10 @@ def values(collectives: Collectives, groups: int) -> dict[str, Any]:
 def test_collectives_and_groups_follow_their_definitions(groups: int) -> None:
     each = 4 // groups
     for rank, result in enumerate(on_ranks(4, values, groups)):
-        assert result["all_gather"] == [0, 1, 2, 3]
-        assert result["broadcast"] == "made by 0"
+        assert (result["all_gather"], result["broadcast"]) == ([0, 1, 2, 3], "made by 0")
         assert result["same"]
         assert not result["different"]
-        assert result["all_reduce"] == 6.0
-        assert result["local"] == 4
+        assert (result["all_reduce"], result["local"]) == (6.0, 4)
         first = rank - rank % each
         assert result["group"] == (rank % each, each, list(range(first, first + each)))
 
@@ -294,8 +292,7 @@ def test_tensors_round_trip_bit_identical(dtype: torch.dtype, shape: tuple[int, 
     tensor = (torch.randn(shape, generator=torch.Generator().manual_seed(0)) * 100).to(dtype)
     decoded = decode(encode({"tensor": tensor, "part": tensor.expand(2, *shape)}))
     for name, expected in (("tensor", tensor), ("part", tensor.expand(2, *shape))):
-        assert decoded[name].dtype == dtype
-        assert decoded[name].shape == expected.shape
+        assert (decoded[name].dtype, decoded[name].shape) == (dtype, expected.shape)
         assert torch.equal(decoded[name], expected)
 
 
@@ -304,8 +301,7 @@ def test_arrays_and_dataclasses_of_tensors_round_trip() -> None:
     decoded_camera, decoded_flags = decode(encode((camera, np.array([True, False]))))
     assert isinstance(decoded_camera, Camera)
     assert torch.equal(decoded_camera.world_to_camera, camera.world_to_camera)
-    assert decoded_flags.dtype == np.bool_
-    assert decoded_flags.tolist() == [True, False]
+    assert (decoded_flags.dtype, decoded_flags.tolist()) == (np.bool_, [True, False])
 
 
 def test_errors_keep_their_type() -> None:
@@ -425,8 +421,7 @@ def test_thread_count_can_be_set_after_kernels_ran() -> None:
 def test_devices_get_an_index(monkeypatch: pytest.MonkeyPatch) -> None:
     """PyTorch refuses a device without one."""
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 3)
-    assert with_index("cuda") == torch.device("cuda", 3)
-    assert with_index("cuda:1") == torch.device("cuda", 1)
+    assert (with_index("cuda"), with_index("cuda:1")) == (torch.device("cuda", 3), torch.device("cuda", 1))
     assert with_index("cpu") == torch.device("cpu")
 
 

@@ -110,8 +110,7 @@ def test_sh_degree_4_is_rendered_up_to_3_and_preserved(tmp_path: Path, text: boo
     whole = torch.cat([held(scene.sh_rest), more], dim=1)
     save(path, table(replace(scene, sh_rest=whole)), text)
     file = read_scene(path, held_bytes=0 if stored else None)
-    assert isinstance(file.scene.sh_rest, StoredHarmonics) == (stored and not text)
-    assert file.scene.sh_degree == 3
+    assert (isinstance(file.scene.sh_rest, StoredHarmonics), file.scene.sh_degree) == (stored and not text, 3)
     assert torch.equal(held(file.scene.sh_rest), held(scene.sh_rest))
     assert file.notes == ("SH bands above degree 3 are not drawn; only a stylized PLY keeps them",)
     write_stylized(file, out, scene.sh_dc * 2, sh_attenuation=0.5)
