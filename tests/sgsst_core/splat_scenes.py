@@ -1,6 +1,7 @@
 """Small synthetic scenes and cameras for tests of rasterizers."""
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -45,6 +46,20 @@ def cloud(count: int = 400, *, seed: int = 0, log_scale: float = -2.5, degree: i
         sh_dc=normal(count, 3),
         sh_rest=0.3 * normal(count, (degree + 1) ** 2 - 1, 3),
     )
+
+
+def needles(count: int) -> Scene:
+    """Return Gaussians at all angles that are a million times longer than wide; some extend far beyond the view."""
+    scene, long = cloud(count, seed=9), torch.linspace(-3, 7, count)[:, None]
+    return replace(scene, scales=torch.cat([long, long - math.log(1e6), long - math.log(1e6)], dim=1))
+
+
+def displaced(scene: Scene, view: Camera, offset: Tensor) -> tuple[Scene, Camera]:
+    """Return a scene and a camera that are both moved by an offset [3]; positions are rounded to float32."""
+    pose = view.world_to_camera.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset.double()
+    means = (scene.means.double() + offset.double()).float()
+    return replace(scene, means=means), replace(view, world_to_camera=pose)
 
 
 def single(

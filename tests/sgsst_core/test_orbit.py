@@ -120,21 +120,18 @@ def lamp() -> Scene:
 
 
 @pytest.mark.parametrize("rotation", ROTATIONS)
-def test_up_follows_from_the_ground_for_any_rotation(rotation: Rotation) -> None:
-    up = up_of(moved(lamp(), rotation, 3.0, (5, -2, 7)))
-    assert degrees(up, rotation) < 1.5
-    assert up.ground
-    assert up.sure
-    assert "flat layer" in up.reason
-
-
-@pytest.mark.parametrize("rotation", ROTATIONS)
-def test_standing_subject_has_its_foot_below(rotation: Rotation) -> None:
-    up = up_of(moved(figure(), rotation, 0.2))
-    assert degrees(up, rotation) < 5
-    assert up.sure
-    assert not up.ground
-    assert "times as tall as wide" in up.reason
+@pytest.mark.parametrize(
+    ("scene", "factor", "shift", "most", "ground", "reason"),
+    [(lamp(), 3.0, (5, -2, 7), 1.5, True, "flat layer"), (figure(), 0.2, (0, 0, 0), 5, False, "times as tall as wide")],
+    ids=["ground", "standing"],
+)
+def test_up_follows_from_ground_or_stature_for_any_rotation(
+    scene: Scene, factor: float, shift: tuple[int, int, int], most: float, ground: bool, reason: str, rotation: Rotation
+) -> None:
+    up = up_of(moved(scene, rotation, factor, shift))
+    assert degrees(up, rotation) < most
+    assert (up.sure, up.ground) == (True, ground)
+    assert reason in up.reason
 
 
 @pytest.mark.parametrize("rotation", ROTATIONS)

@@ -82,15 +82,15 @@ def test_invalid_weights_are_refused(values: tuple[float, ...]) -> None:
 
 def test_scales_beyond_those_of_the_views_are_refused() -> None:
     views = cameras(2, 128, 96)
-    check_scales((1.0, 0.0, 0.5), views, 24)
-    check_scales((1.0, 0.0, 0.0, 0.0), views, 96)
-    check_scales((), views, 96)
-    with pytest.raises(SettingsError, match="gives scale 3 a weight, but the views have 3 scales, 0 to 2"):
-        check_scales((1.0, 0.0, 0.5, 1.0), views, 24)
-    with pytest.raises(SettingsError, match="gives scale 1 a weight, but the views have one scale, 0"):
-        check_scales((0.0, 1.0), views, 96)
-    with pytest.raises(SettingsError, match="gives no weight to the 1 of 3 scales that view 'view_0' has"):
-        check_scales((0.0, 1.0), [*cameras(1, 30, 20), *cameras(2, 128, 96)[1:]], 24)
+    for values, coarsest in (((1.0, 0.0, 0.5), 24), ((1.0, 0.0, 0.0, 0.0), 96), ((), 96)):
+        check_scales(values, views, coarsest)
+    for values, given, coarsest, message in (
+        ((1.0, 0.0, 0.5, 1.0), views, 24, "gives scale 3 a weight, but the views have 3 scales, 0 to 2"),
+        ((0.0, 1.0), views, 96, "gives scale 1 a weight, but the views have one scale, 0"),
+        ((0.0, 1.0), [*cameras(1, 30, 20), views[1]], 24, "no weight to the 1 of 3 scales that view 'view_0' has"),
+    ):
+        with pytest.raises(SettingsError, match=message):
+            check_scales(values, given, coarsest)
 
 
 def test_convergence_ignores_differences_between_views() -> None:

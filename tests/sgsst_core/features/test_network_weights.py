@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -261,19 +260,6 @@ def test_code_in_a_pickle_never_runs(tmp_path: Path) -> None:
     assert not mark.exists()
     pickle.loads(data)
     assert mark.exists(), "the test's own pickle does nothing"
-
-
-def test_pickles_of_arrays_are_flattened() -> None:
-    arrays: dict[str, Any] = {"a": {"b": np.arange(3, dtype=np.float32)}, "c": np.ones((2, 2), np.float32)}
-    for protocol in (3, 4):
-        flat = sources.unpickle_arrays(pickle.dumps(arrays, protocol=protocol), "x")
-        assert flat.keys() == {"a/b", "c"}
-        assert np.array_equal(flat["a/b"], arrays["a"]["b"])
-    for bad in ({"a": [np.zeros(1, np.float32)]}, {"a": np.zeros(1)}, {"a": "text"}, 3):
-        with pytest.raises(WeightsError, match="not a float32 array"):
-            sources.unpickle_arrays(pickle.dumps(bad, protocol=4), "x")
-    with pytest.raises(WeightsError, match="refused"):
-        sources.unpickle_arrays(b"\x80\x03}q", "x")
 
 
 def test_archive_with_other_digest_is_refused(tmp_path: Path) -> None:

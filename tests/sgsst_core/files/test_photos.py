@@ -8,7 +8,6 @@ import torch
 from PIL import Image
 
 from sgsst_core.errors import ImageError
-from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.photos import Photo, check_photos, find_masks, load_photo
 from sgsst_core.scene.camera import Camera, resized
 from tests.sgsst_core.files.test_images import save
@@ -176,12 +175,3 @@ def test_photos_are_resized_to_the_camera_without_aliasing(tmp_path: Path) -> No
     assert large.shape == (240, 360, 3)
     assert float(large.min()) >= 0
     assert float(large.max()) <= 1
-
-
-def test_real_photos_match_their_cameras(shared_data: Path) -> None:
-    photos = shared_data / "photos" / "snowmiku_plush"
-    cameras = read_cameras(photos / "cameras.json")
-    matches = check_photos(photos / "images", cameras)
-    assert [path.stem for path in paths(matches)] == [view.name for view in cameras]
-    small = load_photo(Photo(paths(matches)[5], (990, 742)), resized(cameras[5], 256))
-    assert small.shape == (192, 256, 3)

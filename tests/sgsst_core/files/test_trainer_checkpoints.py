@@ -2,6 +2,7 @@
 
 import os
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -90,56 +91,55 @@ class Command:
         return os.system, ("touch executed",)
 
 
-def write_hostile(case: str, folder: Path) -> Path:
-    path, good = folder / f"{case}.pt", write_gsplat(folder / "good.pt", wall())
-    splats: dict[str, Any] = splats_of(wall())
-    if case == "command":
-        torch.save({"splats": {**splats, "means": Command()}}, path)
-    elif case == "expanded":  # a few bytes that would become terabytes
-        torch.save({"splats": {**splats, "means": torch.zeros(1, 1).expand(1 << 40, 3)}}, path)
-    elif case == "compressed":
-        repacked(good, path, zipfile.ZIP_DEFLATED)
-    elif case == "short":
-        repacked(good, path, cut=8)
-    elif case == "half":
-        path.write_bytes(good.read_bytes()[:5000])
-    elif case == "other":
-        torch.save({"model": splats}, path)
-    elif case == "list":
-        torch.save([splats], path)
-    elif case == "nerfacto":
-        torch.save({"pipeline": {"_model.field.weight": torch.ones(3)}}, path)
-    elif case == "degree 0":
-        write_nerfstudio(path, wall())
-    elif case == "nan":
-        torch.save({"splats": {**splats, "quats": splats["quats"] * torch.nan}}, path)
-    elif case == "text":
-        torch.save({"splats": {**splats, "opacities": "many"}}, path)
-    return path
+#: Functions that write a file, given its path, a good checkpoint and its splats; and problems of the file.
+HOSTILE: dict[str, tuple[Callable[[Path, Path, dict[str, Any]], object], str]] = {
+    "command": (
+        lambda path, good, splats: torch.save({"splats": {**splats, "means": Command()}}, path),
+        "more than tensors and plain values. Such a file can run any program",
+    ),
+    "expanded": (  # a few bytes that would become terabytes
+        lambda path, good, splats: torch.save(
+            {"splats": {**splats, "means": torch.zeros(1, 1).expand(1 << 40, 3)}}, path
+        ),
+        "`means` is larger than its data",
+    ),
+    "compressed": (lambda path, good, splats: repacked(good, path, zipfile.ZIP_DEFLATED), "compressed entries"),
+    "short": (lambda path, good, splats: repacked(good, path, cut=8), "damaged checkpoint"),
+    "half": (
+        lambda path, good, splats: path.write_bytes(good.read_bytes()[:5000]),
+        "cannot be read: File is not a zip file",
+    ),
+    "other": (
+        lambda path, good, splats: torch.save({"model": splats}, path),
+        "neither a checkpoint of gsplat's trainer nor one of nerfstudio.*ns-export",
+    ),
+    "list": (
+        lambda path, good, splats: torch.save([splats], path),
+        r"neither a checkpoint.*original 3DGS code has point_cloud/iteration_\*/point_cloud\.ply beside it",
+    ),
+    "nerfacto": (
+        lambda path, good, splats: torch.save({"pipeline": {"_model.field.weight": torch.ones(3)}}, path),
+        "holds no Gaussians",
+    ),
+    "degree 0": (lambda path, good, splats: write_nerfstudio(path, wall()), "SH degree 0"),
+    "nan": (
+        lambda path, good, splats: torch.save({"splats": {**splats, "quats": splats["quats"] * torch.nan}}, path),
+        "nan.pt: The scene: `quats` holds 2464 NaN",
+    ),
+    "text": (
+        lambda path, good, splats: torch.save({"splats": {**splats, "opacities": "many"}}, path),
+        "`opacities` is a str",
+    ),
+}
 
 
-@pytest.mark.parametrize(
-    ("case", "problem"),
-    [
-        ("command", "more than tensors and plain values. Such a file can run any program"),
-        ("expanded", "`means` is larger than its data"),
-        ("compressed", "compressed entries"),
-        ("short", "damaged checkpoint"),
-        ("half", "cannot be read: File is not a zip file"),
-        ("other", "neither a checkpoint of gsplat's trainer nor one of nerfstudio.*ns-export"),
-        ("list", r"neither a checkpoint.*original 3DGS code has point_cloud/iteration_\*/point_cloud\.ply beside it"),
-        ("nerfacto", "holds no Gaussians"),
-        ("degree 0", "SH degree 0"),
-        ("nan", "nan.pt: The scene: `quats` holds 2464 NaN"),
-        ("text", "`opacities` is a str"),
-    ],
-)
-def test_unusable_checkpoints_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str, problem: str
-) -> None:
+@pytest.mark.parametrize("case", HOSTILE)
+def test_unusable_checkpoints_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
     monkeypatch.chdir(tmp_path)
+    path, (write, problem) = tmp_path / f"{case}.pt", HOSTILE[case]
+    write(path, write_gsplat(tmp_path / "good.pt", wall()), splats_of(wall()))
     with pytest.raises(SceneError, match=problem):
-        load_scene(write_hostile(case, tmp_path))
+        load_scene(path)
     assert not Path("executed").exists()
 
 

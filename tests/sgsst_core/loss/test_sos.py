@@ -169,22 +169,6 @@ def test_float32_tiles_agree_with_untiled_float64(tiny_weights, case):
     assert relative_error(tiled.image_gradient, whole.image_gradient) < 1e-5
 
 
-def test_single_region_is_bit_identical_to_no_regions(tiny_weights, case):
-    """Results are bit-identical: same statistics, same position weights."""
-    image, content, styles, maps, _ = case
-    network = FeatureNetwork(tiny_weights)
-    loss = SosLoss(network, coarsest=60)
-    content = content.float()
-    plain = loss.evaluate(
-        image.float(), loss.targets.of_style(Style.of(styles[0]), SIZE), loss.targets.of_view(content, maps[2])
-    )
-    view = loss.targets.of_view(content, maps[2])
-    view.regions = [loss.targets.position_weights(maps[2])]
-    result = loss.evaluate(image.float(), targets_of(loss, styles[:1], [1.0]), view)
-    assert torch.equal(result.values, plain.values)
-    assert torch.equal(result.image_gradient, plain.image_gradient)
-
-
 # --- resolved regions ----------------------------------------------------------------------------------------------
 
 

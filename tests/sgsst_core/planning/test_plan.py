@@ -23,7 +23,7 @@ from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.parallel.division import Size, Tiling
 from sgsst_core.planning.facts import Device, Facts, Machine, describe_machine, evaluated_pixels
 from sgsst_core.planning.plan import Plan, choose_precision, make_plan, with_groups
-from sgsst_core.planning.survey import Survey, survey_views
+from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import Pace, TimeChoice, choosable, choose
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import repeating_options
@@ -157,22 +157,6 @@ def test_decisions_name_skipped_work(tiny_weights: BackboneWeights) -> None:
     }
     assert (decisions["unseen Gaussians"].bytes or 0) == int((~plan.seen).sum()) * 48
     assert plan.steps_coarse == 0
-
-
-def test_survey_finds_weights_regions_and_blind_views() -> None:
-    scene = behind(ball(), 10)
-    views = cameras(2)
-    away = replace(views[0], world_to_camera=torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64)))
-    rasterizer = make_rasterizer("cpu", replace(scene, means=scene.means.clamp_min(0)))
-    survey = survey_views(rasterizer.scene, [*views, away], rasterizer)  # type: ignore[attr-defined]
-    assert survey.covered == [0, 1]
-    expected = sum(rasterizer.coverage(camera).double().sum() for camera in views)
-    assert float(survey.total_blend_weights.sum()) == pytest.approx(float(expected), rel=1e-5)
-    coverage = rasterizer.coverage(views[0])
-    outside = coverage.clone()
-    outside[survey.regions[0].slices] = 0
-    assert outside.max() == 0
-    assert 0 < survey.regions[0].pixels < coverage.numel()
 
 
 def test_unseen_gaussians_follow_their_seen_neighbors() -> None:

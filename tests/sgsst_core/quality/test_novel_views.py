@@ -37,6 +37,7 @@ from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Style
 from tests.sgsst_core.objects import joined
+from tests.sgsst_core.splat_scenes import displaced
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 AXIS = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
@@ -491,14 +492,8 @@ def test_pairs_without_overlap_have_no_value(lpips):
 def test_distance_from_the_origin_does_not_change_values():
     scene = plane(5, 4, DEPTH)
     offset = torch.tensor([2.0**18, -(2.0**17), 2.0**19])
-    moved = replace(scene, means=scene.means + offset)
-    cameras = arc(3)
-    far = []
-    for view in cameras:
-        pose = view.world_to_camera.clone()
-        pose[:3, 3] -= pose[:3, :3] @ offset.double()
-        far.append(replace(view, world_to_camera=pose))
-    near_result, far_result = measure(scene, cameras), measure(moved, far)
+    far = [displaced(scene, view, offset) for view in arc(3)]
+    near_result, far_result = measure(scene, arc(3)), measure(far[0][0], [view for _, view in far])
     assert far_result.rmse == pytest.approx(near_result.rmse, rel=1e-3)
     assert far_result.compared == pytest.approx(near_result.compared, abs=1e-3)
 

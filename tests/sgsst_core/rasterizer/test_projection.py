@@ -17,7 +17,7 @@ from sgsst_core.rasterizer.reference import splat
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
-from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, rotated_pose, single, together
+from tests.sgsst_core.splat_scenes import camera, cloud, displaced, empty_scene, rotated_pose, single, together
 
 _HALF_LOG2_E = 0.5 * math.log2(math.e)
 
@@ -128,10 +128,6 @@ def test_huge_gaussians_and_empty_scenes_are_projected() -> None:
 def test_scene_far_from_origin_projects_alike() -> None:
     scene, view = cloud(300), camera(pose=rotated_pose())
     scene = replace(scene, means=(scene.means * 16).round() / 16)
-    offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
-    pose = view.world_to_camera.clone()
-    pose[:3, 3] -= pose[:3, :3] @ offset
-    here = project(scene, view)
-    there = project(replace(scene, means=scene.means + offset.float()), replace(view, world_to_camera=pose))
+    here, there = project(scene, view), project(*displaced(scene, view, torch.tensor([1e6, -1e6, 1e6])))
     assert here.gaussians.tolist() == there.gaussians.tolist()
     assert np.allclose(here.values, there.values, rtol=1e-6, atol=1e-6)

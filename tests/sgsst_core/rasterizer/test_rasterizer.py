@@ -37,6 +37,7 @@ from tests.sgsst_core.splat_scenes import (
     cloud,
     colors_of,
     empty_scene,
+    needles,
     pixels_like,
     rotated_pose,
     single,
@@ -57,7 +58,7 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
         replace(cloud(1500, seed=2, log_scale=-1.5), opacities=torch.full((1500,), 3.0)),
         camera(40, 33),
     ),
-    "needles": lambda: (_needles(), camera(97, 61)),
+    "needles": lambda: (needles(200), camera(97, 61)),
     "huge": lambda: (cloud(60, seed=3, log_scale=3.0), camera(50, 31)),
     "tiny": lambda: (cloud(3000, seed=4, log_scale=-7.0), camera(80, 50)),
     "faint": lambda: (replace(cloud(seed=5), opacities=torch.linspace(-5.6, -5.4, 400)), camera()),
@@ -65,15 +66,8 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "one row": lambda: (cloud(seed=7), camera(333, 1)),
     "close by": lambda: (cloud(seed=8, depth=0.3), camera()),
     "antialiased": lambda: (replace(cloud(900, seed=14, log_scale=-4.0), rendering=Rendering("antialiased")), camera()),
-    "other blur": lambda: (replace(_needles(), rendering=Rendering("antialiased", 0.1)), camera(97, 61)),
+    "other blur": lambda: (replace(needles(200), rendering=Rendering("antialiased", 0.1)), camera(97, 61)),
 }
-
-
-def _needles() -> Scene:
-    """Return Gaussians at all angles that are a million times longer than wide; some extend far beyond the view."""
-    scene = cloud(200, seed=9)
-    long = torch.linspace(-3, 7, 200)[:, None]
-    return replace(scene, scales=torch.cat([long, long - math.log(1e6), long - math.log(1e6)], dim=1))
 
 
 @pytest.fixture(params=CASES)

@@ -27,7 +27,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
 from tests.sgsst_core.rasterizer.references import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, pixels_like, rotated_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, displaced, needles, pixels_like, rotated_pose
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
@@ -36,13 +36,6 @@ pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
 BACKGROUND = (1.0, 0.25, 0.5)
 #: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
-
-
-def needles() -> Scene:
-    """Return Gaussians at all angles that are a million times longer than wide; some extend far beyond the view."""
-    scene = cloud(60, seed=9)
-    long = torch.linspace(-3, 7, 60)[:, None]
-    return replace(scene, scales=torch.cat([long, long - math.log(1e6), long - math.log(1e6)], dim=1))
 
 
 def opaque() -> Scene:
@@ -55,18 +48,15 @@ def opaque() -> Scene:
 
 def far_away() -> tuple[Scene, Camera]:
     """Return a scene and a camera a million units from the origin, where float32 has a resolution of 1/16."""
-    scene, view = cloud(80, seed=12), camera(33, 17)
+    scene = cloud(80, seed=12)
     offset = torch.tensor([1e6, -2e6, 1.5e6])
-    means = scene.means.double().round(decimals=0) + offset.double()
-    pose = view.world_to_camera.clone()
-    pose[:3, 3] -= pose[:3, :3] @ offset.double()
-    return replace(scene, means=means.float()), replace(view, world_to_camera=pose)
+    return displaced(replace(scene, means=scene.means.round()), camera(33, 17), offset)
 
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "rotated": lambda: (cloud(100, seed=1), camera(33, 20, pose=rotated_pose())),
     "opaque": lambda: (opaque(), camera(20, 18)),
-    "needles": lambda: (needles(), camera(33, 20)),
+    "needles": lambda: (needles(60), camera(33, 20)),
     "huge": lambda: (cloud(40, seed=3, log_scale=3.0), camera(20, 15)),
     "tiny, most tiles empty": lambda: (cloud(12, seed=4, log_scale=-7.0), camera(65, 35)),
     "faint": lambda: (replace(cloud(150, seed=5), opacities=torch.linspace(-5.6, -5.4, 150)), camera(33, 33)),
@@ -78,7 +68,7 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
         replace(cloud(120, seed=14, log_scale=-4.0), rendering=Rendering("antialiased")),
         camera(33, 20),
     ),
-    "antialiased needles": lambda: (replace(needles(), rendering=Rendering("antialiased", 0.1)), camera(33, 20)),
+    "antialiased needles": lambda: (replace(needles(60), rendering=Rendering("antialiased", 0.1)), camera(33, 20)),
 }
 
 

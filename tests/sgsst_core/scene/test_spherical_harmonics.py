@@ -37,7 +37,7 @@ from sgsst_core.scene.spherical_harmonics import (
 )
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.files.formats.samples import rewritten
-from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, displaced, rotated_pose
 
 
 def sphere(polar: int = 64, around: int = 128) -> tuple[Tensor, Tensor]:
@@ -105,14 +105,6 @@ def test_basis_has_signs_and_order_of_3dgs_files() -> None:
     assert torch.allclose(actual, torch.tensor(expected, dtype=torch.float64), atol=1e-14)
 
 
-def far_from_the_origin() -> tuple[Scene, Camera]:
-    scene, view = cloud(300, degree=3), camera(pose=rotated_pose())
-    offset = torch.tensor([1e6, -2e6, 1.5e6], dtype=torch.float64)
-    pose = view.world_to_camera.clone()
-    pose[:3, 3] -= pose[:3, :3] @ offset
-    return replace(scene, means=(scene.means.double() + offset).float()), replace(view, world_to_camera=pose)
-
-
 def at_the_center() -> tuple[Scene, Camera]:
     """Return Gaussians at the camera's center, and at distances whose squares underflow or overflow."""
     scene = cloud(5, degree=3)
@@ -129,7 +121,9 @@ def huge_coefficients() -> tuple[Scene, Camera]:
 
 KERNEL_CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "ordinary": lambda: (cloud(300, degree=3), camera(pose=rotated_pose())),
-    "camera far from the origin": far_from_the_origin,
+    "camera far from the origin": lambda: displaced(
+        cloud(300, degree=3), camera(pose=rotated_pose()), torch.tensor([1e6, -2e6, 1.5e6])
+    ),
     "a Gaussian at the center": at_the_center,
     "huge coefficients": huge_coefficients,
     "no Gaussian": lambda: (cloud(0, degree=3), camera()),
@@ -340,20 +334,27 @@ def test_invalid_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
     assert torch.equal(again.sh_dc, stored.sh_dc + 1)
 
 
-@pytest.mark.parametrize("change", ["shortened", "emptied", "overwritten", "longer"])
-def test_changed_file_raises_an_error_instead_of_a_signal(tmp_path: Path, change: str) -> None:
+def overwrite(path: Path, data: bytes) -> None:
+    path.write_bytes(data[:-4] + bytes(4))
+    os.utime(path, ns=(0, 0))  # file systems may update times late
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda path, data: os.truncate(path, len(data) // 2),
+        lambda path, data: path.write_bytes(b""),
+        overwrite,
+        lambda path, data: path.write_bytes(data + b"\0"),
+    ],
+    ids=["shortened", "emptied", "overwritten", "longer"],
+)
+def test_changed_file_raises_an_error_instead_of_a_signal(
+    tmp_path: Path, change: Callable[[Path, bytes], object]
+) -> None:
     path = written(tmp_path)
     scene = both(path)[0]
-    size, data = path.stat().st_size, path.read_bytes()
-    if change == "shortened":
-        os.truncate(path, size // 2)
-    elif change == "emptied":
-        path.write_bytes(b"")
-    elif change == "overwritten":
-        path.write_bytes(data[:-4] + b"\0\0\0\0")
-        os.utime(path, ns=(0, 0))  # file systems may update times late
-    else:
-        path.write_bytes(data + b"\0")
+    change(path, path.read_bytes())
     with pytest.raises(SceneError, match="was changed after it was read"):
         rest_colors(scene.sh_rest, scene.means, camera())
 

@@ -164,10 +164,12 @@ def test_previous_checkpoint_replaces_an_unusable_one(full_checkpoint: Checkpoin
         )
 
 
-def test_fingerprint_distinguishes_jobs() -> None:
+def test_fingerprint_distinguishes_jobs_but_not_their_budgets() -> None:
     scene, views, image, settings = wall(), cameras(), style(), make_settings()
-    base = fingerprint(scene, views, Style.of(image), settings, "w")
-    assert base == fingerprint(wall(), cameras(), Style.of(style()), make_settings(), "w")
+    base, both = fingerprint(scene, views, Style.of(image), settings, "w"), [image, image.flip(0)]
+    for same in (make_settings(), make_settings(within=3, memory_limit=10**9, measure=0.0)):
+        assert fingerprint(wall(), cameras(), Style.weighted([style()], [3]), same, "w") == base
+    mixtures = [Style.weighted(both, [1, 1]), Style.weighted(both, [1, 2]), Style.weighted(both[::-1], [1, 2])]
     moved = scene.means.clone()
     moved[-1, 2] = torch.nextafter(moved[-1, 2], torch.tensor(9.0))
     others = [
@@ -180,26 +182,6 @@ def test_fingerprint_distinguishes_jobs() -> None:
         fingerprint(scene, views, Style.of(image), make_settings(background=(1, 1, 1)), "w"),
         fingerprint(scene, views, Style.of(image), settings, "v"),
         fingerprint(scene, views, Style.of(image), settings, "w", "photos"),
+        *(fingerprint(scene, views, mixture, settings, "w") for mixture in mixtures),
     ]
     assert len({base, *others}) == len(others) + 1
-
-
-def test_fingerprint_ignores_budgets() -> None:
-    scene, views, image = wall(), cameras(), style()
-    free = make_settings(within=3, memory_limit=10**9, measure=0.0)
-    assert fingerprint(scene, views, Style.of(image), free, "w") == fingerprint(
-        scene, views, Style.of(image), make_settings(), "w"
-    )
-
-
-def test_fingerprint_distinguishes_styles_and_their_weights() -> None:
-    scene, views, settings = wall(), cameras(), make_settings()
-    images = [style(), style().flip(0)]
-    alone = fingerprint(scene, views, Style.of(style()), settings, "w")
-    assert fingerprint(scene, views, Style.weighted(images[:1], [3]), settings, "w") == alone
-    mixtures = [([0, 1], [1, 1]), ([0, 1], [1, 2]), ([1, 0], [1, 2])]
-    fingerprints = {
-        fingerprint(scene, views, Style.weighted([images[i] for i in order], weights), settings, "w")
-        for order, weights in mixtures
-    }
-    assert len(fingerprints | {alone}) == 4

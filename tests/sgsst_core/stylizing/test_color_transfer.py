@@ -94,22 +94,25 @@ def test_style_images_count_by_their_weights() -> None:
     assert float((colors < 0.5).all(dim=1).double().mean()) == pytest.approx(0.75, abs=0.02)
 
 
+RANDOM, TEXTURE = (
+    torch.randn(50, 3, generator=torch.Generator().manual_seed(1)),
+    synthetic_image(30, 30, seed=2).float(),
+)
+
+
 @pytest.mark.parametrize("start", [with_moments, warm_start])
-@pytest.mark.parametrize("case", ["gray scene", "one color", "one Gaussian", "style of one color", "black style"])
-def test_flat_scenes_and_styles_give_finite_colors_in_range(case: str, start: Start) -> None:
-    generator = torch.Generator().manual_seed(1)
-    style = synthetic_image(30, 30, seed=2).float()
-    sh_dc = torch.randn(50, 3, generator=generator)
-    if case == "gray scene":
-        sh_dc = sh_dc[:, :1].expand(-1, 3).contiguous()
-    elif case == "one color":
-        sh_dc = torch.full((50, 3), 0.3)
-    elif case == "one Gaussian":
-        sh_dc = sh_dc[:1]
-    elif case == "style of one color":
-        style = torch.full((10, 10, 3), 0.25)
-    else:
-        style = torch.zeros((10, 10, 3))
+@pytest.mark.parametrize(
+    ("sh_dc", "style"),
+    [
+        (RANDOM[:, :1].expand(-1, 3).contiguous(), TEXTURE),
+        (torch.full((50, 3), 0.3), TEXTURE),
+        (RANDOM[:1], TEXTURE),
+        (RANDOM, torch.full((10, 10, 3), 0.25)),
+        (RANDOM, torch.zeros((10, 10, 3))),
+    ],
+    ids=["gray scene", "one color", "one Gaussian", "style of one color", "black style"],
+)
+def test_flat_scenes_and_styles_give_finite_colors_in_range(sh_dc: Tensor, style: Tensor, start: Start) -> None:
     colors = colors_of(start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style)))
     assert bool(colors.isfinite().all())
     assert -1e-6 <= float(colors.min()) <= float(colors.max()) <= 1 + 1e-6

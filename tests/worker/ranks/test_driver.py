@@ -13,7 +13,7 @@ from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedEr
 from sgsst_core.progress import Progress
 from worker.job import memory_beside_gpus, scene_bytes
 from worker.prepare import Prepared
-from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, first_line, reserve
+from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, reserve
 from worker.ranks.driver import MOST_ATTEMPTS, FailedAttempt, Failure, Relay, check_retry, failure_of
 from worker.ranks.rank import RankStatus
 from worker.run import Listener
@@ -92,11 +92,6 @@ def test_different_error_step_or_progress_is_retried() -> None:
     assert twice(error, RuntimeError("NCCL error"))
     assert twice(error, steps=(4, 5))
     assert check_retry([failed(raised(error), 4, progressed=True)] * 2)
-
-
-def test_error_summary_is_first_line_or_type() -> None:
-    assert first_line(RuntimeError("  It broke.\nAt length.")) == "It broke"
-    assert first_line(RuntimeError()) == "RuntimeError"
 
 
 class EventRecorder:

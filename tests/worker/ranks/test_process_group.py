@@ -27,7 +27,7 @@ from sgsst_core.features.statistics import LayerStatistics, layer_statistics
 from sgsst_core.files.photos import Photo
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.messages import decode, encode
-from sgsst_core.parallel.collectives import Collectives, ImageExchange, Team, same_on_all
+from sgsst_core.parallel.collectives import Collectives, ImageExchange, same_on_all
 from sgsst_core.planning.facts import Machine
 from sgsst_core.progress import Decision, Progress
 from sgsst_core.scene.camera import Camera, Lens
@@ -352,15 +352,6 @@ def test_messages_cannot_name_other_classes_or_functions(value: Any) -> None:
 def test_invalid_bytes_are_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match="not a message of this program"):
         decode(torch.tensor(list(data), dtype=torch.uint8))
-
-
-def group_of_rank(collectives: Collectives) -> tuple[int, int, int]:
-    team = Team(make_settings(views_per_step=2), collectives)
-    return team.everybody.size, team.groups, team.own_group
-
-
-def test_ranks_form_groups() -> None:
-    assert on_ranks(4, group_of_rank) == [(4, 2, 0), (4, 2, 0), (4, 2, 1), (4, 2, 1)]
 
 
 def wait_for_first(collectives: Collectives, seen: Path) -> bool:
