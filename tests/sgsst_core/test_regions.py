@@ -79,20 +79,19 @@ NAN = float("nan")
 MEANS = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1, 2, 1], [-3, 0, 0], [NAN, 0, 0]])
 
 
-def test_box_includes_its_border_for_any_order_of_corners():
-    wanted = [True, True, False, False, False]
-    assert in_box(MEANS, (0, 0, 0, 1, 1, 1)).tolist() == wanted
-    assert in_box(MEANS, (1, 0, 1, 0, 1, 0)).tolist() == wanted
-
-
-def test_sphere_includes_its_border():
-    assert in_sphere(MEANS, (0, 0, 0, 3**0.5)).tolist() == [True, True, False, False, False]
-    assert in_sphere(MEANS, (0, 0, 0, 3)).tolist() == [True, True, True, True, False]
-
-
-def test_half_space_lies_on_the_side_of_its_normal():
-    assert in_half_space(MEANS, (1, 0, 0, 1)).tolist() == [False, True, True, False, False]
-    assert in_half_space(MEANS, (-2, 0, 0, 6)).tolist() == [False, False, False, True, False]
+@pytest.mark.parametrize(
+    ("select", "numbers", "wanted"),
+    [
+        (in_box, (0, 0, 0, 1, 1, 1), [True, True, False, False, False]),
+        (in_box, (1, 0, 1, 0, 1, 0), [True, True, False, False, False]),  # for any order of corners
+        (in_sphere, (0, 0, 0, 3**0.5), [True, True, False, False, False]),
+        (in_sphere, (0, 0, 0, 3), [True, True, True, True, False]),
+        (in_half_space, (1, 0, 0, 1), [False, True, True, False, False]),  # on the side of its normal
+        (in_half_space, (-2, 0, 0, 6), [False, False, False, True, False]),
+    ],
+)
+def test_shapes_include_their_border(select, numbers, wanted):
+    assert select(MEANS, numbers).tolist() == wanted
 
 
 @pytest.mark.parametrize(

@@ -63,10 +63,9 @@ def test_tiny_image_is_ignored_in_layers_without_cells(tiny_weights):
 
 
 def test_number_of_vectors_is_limited_in_proportion_to_weights():
-    assert positions_per_image([MAX_VECTORS, MAX_VECTORS], [0.75, 0.25], MAX_VECTORS) == [6144, 2048]
-    assert positions_per_image([3, 10**6], [0.9, 0.1], MAX_VECTORS) == [3, 819]
+    cases = ([MAX_VECTORS, MAX_VECTORS], [0.75, 0.25]), ([3, 10**6], [0.9, 0.1]), ([3, 4], [0.1, 0.9])
+    assert [positions_per_image(*case, MAX_VECTORS) for case in cases] == [[6144, 2048], [3, 819], [3, 4]]
     assert positions_per_image([10**6, 10**6], [1 - 1e-9, 1e-9], MAX_VECTORS)[1] == 1
-    assert positions_per_image([3, 4], [0.1, 0.9], MAX_VECTORS) == [3, 4]
 
 
 @pytest.mark.parametrize("weights", [[], [1.0, 0.0], [1.0, -1.0], [float("nan")], [float("inf"), 1.0]])

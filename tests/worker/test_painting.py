@@ -31,18 +31,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with a scene and the picture of its first view."""
     folder = tmp_path_factory.mktemp("painting")
     write_scene(folder / "scene.ply", wall(sh_degree=1))
-    assert (
-        main(
-            ["paint", str(folder / "scene.ply"), *OPTIONS, "--export", "orbit_0000", "--out", str(folder / "view.png")]
-        )
-        == 0
-    )
+    assert command(folder, *OPTIONS, "--export", "orbit_0000", out="view.png") == 0
     return folder
 
 
-def paint(folder: Path, name: str, view: str = "orbit_0000") -> int:
-    out = str(folder / "painted.ply")
-    return main(["paint", str(folder / "scene.ply"), *OPTIONS, "--view", f"{view}={folder / name}", "--out", out])
+def command(folder: Path, *options: str, out: str = "painted.ply") -> int:
+    return main(["paint", str(folder / "scene.ply"), *options, "--out", str(folder / out)])
+
+
+def paint(folder: Path, name: str, view: str = "orbit_0000", out: str = "painted.ply") -> int:
+    return command(folder, *OPTIONS, "--view", f"{view}={folder / name}", out=out)
 
 
 def test_scene_follows_a_painted_picture(folder: Path) -> None:
@@ -84,27 +82,20 @@ def test_unusable_pictures_are_refused(
 def test_inputs_are_not_overwritten(folder: Path, name: str) -> None:
     shutil.copy(folder / "view.png", folder / "kept.png")
     files = {path: path.read_bytes() for path in folder.iterdir()}
-    view = f"orbit_0000={folder / 'kept.png'}"
-    assert (
-        main(["paint", str(folder / "scene.ply"), *OPTIONS, "--view", view, "--out", str(folder / name)]) == BAD_INPUT
-    )
+    assert paint(folder, "kept.png", out=name) == BAD_INPUT
     if name != "kept.png":
-        exported = [*OPTIONS, "--export", "orbit_0000", "--out", str(folder / name)]
-        assert main(["paint", str(folder / "scene.ply"), *exported]) == BAD_INPUT
+        assert command(folder, *OPTIONS, "--export", "orbit_0000", out=name) == BAD_INPUT
     assert {path: path.read_bytes() for path in folder.iterdir()} == files
 
 
 def test_result_has_the_format_of_its_name(folder: Path) -> None:
-    out = folder / "painted.spz"
-    view = f"orbit_0000={folder / 'view.png'}"
-    assert main(["paint", str(folder / "scene.ply"), *OPTIONS, "--view", view, "--out", str(out)]) == 0
-    assert read_scene(out).format == "spz"
+    assert paint(folder, "view.png", out="painted.spz") == 0
+    assert read_scene(folder / "painted.spz").format == "spz"
 
 
 def test_picture_is_recognized_by_itself(folder: Path) -> None:
-    out = str(folder / "painted.ply")
     shutil.copy(folder / "view.png", folder / "renamed.png")
-    assert main(["paint", str(folder / "scene.ply"), "--view", str(folder / "renamed.png"), "--out", out]) == 0
+    assert command(folder, "--view", str(folder / "renamed.png")) == 0
     report = json.loads((folder / "painted.report.json").read_text())
     assert report["views"] == [{"name": "orbit_0000", "width": 91, "height": 76}]
     assert report["psnr_before"] > 45, "the picture has the resolution of its export, not of the cameras"
@@ -115,8 +106,7 @@ def test_hostile_text_chunk_is_ignored(folder: Path, capsys: pytest.CaptureFixtu
     metadata.add_text("sgsst-view", '{"view": "orbit_0000", "camera": {"width": 1e99}}')
     with Image.open(folder / "view.png") as image:
         image.save(folder / "hostile.png", pnginfo=metadata)
-    out = str(folder / "painted.ply")
-    assert main(["paint", str(folder / "scene.ply"), "--view", str(folder / "hostile.png"), "--out", out]) == BAD_INPUT
+    assert command(folder, "--view", str(folder / "hostile.png")) == BAD_INPUT
     assert "does not state its view" in " ".join(capsys.readouterr().err.split())
 
 

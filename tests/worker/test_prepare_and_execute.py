@@ -21,7 +21,7 @@ from sgsst_core.stylizing.checkpoint import Checkpoints, load_checkpoint, save_p
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.stylizing.test_refining import large_wall
-from tests.small_scenes import cameras, wall
+from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.faults import Fault, small_request
 from worker import prepare as previews_module
 from worker.execute import execute
@@ -297,12 +297,15 @@ def test_colors_file_matches_the_result(request_: JobSpec, tmp_path: Path) -> No
             assert np.array_equal(colors, exact.numpy().astype(np.float16))
 
 
-def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(
-    tiny_weights: BackboneWeights, tmp_path: Path
-) -> None:
-    settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
-    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
-    stylizer = Stylizer.planned(wall(), cameras(), style, settings, weights=tiny_weights)
+@pytest.fixture
+def stylizer(tiny_weights: BackboneWeights) -> Stylizer:
+    """Return a job of three steps, with Gaussians that no view shows."""
+    settings, scene = make_settings("standard", steps_coarse=0, steps_sos=3, coarsest_side=24), wall()
+    scene.means[:5] += 1000
+    return Stylizer.planned(scene, cameras(), style(), settings, weights=tiny_weights)
+
+
+def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(stylizer: Stylizer, tmp_path: Path) -> None:
     run(stylizer)
     missing: list[str] = []
     Previews(tmp_path, 3600, missing.append).finish(stylizer)
@@ -321,17 +324,10 @@ def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(
         assert np.abs(thumbnail[part] - wanted).mean() < 5  # JPEG
 
 
-def test_live_colors_are_those_of_the_step(
-    tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_live_colors_are_those_of_the_step(stylizer: Stylizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("_COLOR_SECONDS", "_COLOR_SHARE"):
         monkeypatch.setattr(previews_module, name, 0)
     monkeypatch.setattr(previews_module, "_COST_SHARE", 1e9)
-    settings = make_settings("standard", steps_coarse=0, steps_sos=3, coarsest_side=24)
-    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
-    scene = wall()
-    scene.means[:5] += 1000  # no view shows them
-    stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
     missing: list[str] = []
     colors, by_step = LiveColors(tmp_path / "live", missing.append), {}
 

@@ -1,11 +1,14 @@
 """Independent renderer, and comparison of renders outside the band where rounding decides."""
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from tests.sgsst_core.splat_scenes import colors_of, pixels_like
 
 Array = NDArray[np.float64]
 
@@ -109,3 +112,14 @@ def relative_error(actual: Tensor, expected: Tensor) -> float:
     """Return |actual - expected| / |expected| in the Euclidean norm; 0 if both are 0."""
     difference = float((actual.double() - expected.double()).norm())
     return difference / float(expected.double().norm()) if difference else 0.0
+
+
+def assert_background(rasterizer: Rasterizer, scene: Scene, camera: Camera, background: tuple[float, ...]) -> None:
+    """Assert that a view shows none of a scene's Gaussians, and that no gradient reaches them."""
+    expected = torch.tensor(background).expand(camera.height, camera.width, 3)
+    assert torch.equal(rasterizer.render(colors_of(scene), camera).cpu().float(), expected)
+    assert not rasterizer.coverage(camera).any()
+    assert not any(values.any() for values in rasterizer.survey(camera))
+    gradient = rasterizer.color_gradient(pixels_like(camera), camera)
+    assert gradient.shape == (len(scene), 3)
+    assert not gradient.any()

@@ -31,7 +31,7 @@ from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from tests.real_scenes import scene_path
 from tests.sgsst_core.rasterizer import references as independent
-from tests.sgsst_core.rasterizer.references import assert_close_outside_band, relative_error
+from tests.sgsst_core.rasterizer.references import assert_background, assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (
     camera,
     cloud,
@@ -208,15 +208,8 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
     ids=["empty", "behind", "beside", "faint"],
 )
 def test_view_without_gaussians_is_background(name: str, scene: Scene) -> None:
-    view, rasterizer = camera(), make_rasterizer(name, scene, background=(0.5, 0.25, 0.125))
-    image = rasterizer.render(colors_of(scene), view)
-    assert image[..., 0].eq(0.5).all()
-    assert image[..., 2].eq(0.125).all()
-    assert not rasterizer.coverage(view).any()
-    assert not any(values.any() for values in rasterizer.survey(view))
-    gradient = rasterizer.color_gradient(pixels_like(view), view)
-    assert gradient.shape == (len(scene), 3)
-    assert not gradient.any()
+    background = (0.5, 0.25, 0.125)
+    assert_background(make_rasterizer(name, scene, background=background), scene, camera(), background)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -388,7 +381,6 @@ def test_derived_scenes_keep_the_rendering() -> None:
 def test_requested_rendering_overrides_mode_and_eps2d() -> None:
     mip, flat = Rendering("antialiased", 0.1), Rendering("2dgs")
     assert mip.requested("auto", None) == mip.requested("antialiased", None) == mip
-    assert mip.requested("classic", None) == CLASSIC
+    assert (mip.requested("classic", None), flat.requested("classic", None)) == (CLASSIC, flat)
     assert CLASSIC.requested("antialiased", None) == Rendering("antialiased", 0.3)
     assert CLASSIC.requested("auto", 0.2) == Rendering("classic", 0.2)
-    assert flat.requested("classic", None) == flat

@@ -22,7 +22,7 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.job import JobInputs, prepare_job
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests.sgsst_core.rasterizer.references import assert_close_outside_band, relative_error
+from tests.sgsst_core.rasterizer.references import assert_background, assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, is_cached, pixels_like, rotated_pose
 from tests.small_scenes import ball, cameras, style
 
@@ -116,13 +116,7 @@ def test_crops_of_a_view_make_up_the_whole_view(precision: Precision | None) -> 
 
 @pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
 def test_view_without_gaussians_is_background(scene: Scene, precision: Precision | None) -> None:
-    rasterizer, view = with_weights(scene, precision), camera(20, 18)
-    assert torch.equal(rasterizer.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
-    assert not rasterizer.coverage(view).any()
-    assert not any(values.any() for values in rasterizer.survey(view))
-    gradient = rasterizer.color_gradient(pixels_like(view), view)
-    assert gradient.shape == (len(scene), 3)
-    assert not gradient.any()
+    assert_background(with_weights(scene, precision), scene, camera(20, 18), BACKGROUND)
 
 
 @pytest.mark.slow

@@ -98,12 +98,6 @@ def test_large_gaussians_are_split_within_the_budget_and_images_are_preserved(
     assert psnr(sum(errors) / len(errors)) == pytest.approx(refinement.psnr, abs=0.01)
 
 
-def test_refinement_is_deterministic(tiny_weights: BackboneWeights) -> None:
-    first, second = refinement_of(tiny_weights, 2.0), refinement_of(tiny_weights, 2.0)
-    assert torch.equal(first.pieces, second.pieces)
-    assert first.psnr == second.psnr
-
-
 def test_nothing_is_split_if_no_gaussian_is_large(tiny_weights: BackboneWeights) -> None:
     small = replace(wall(), scales=torch.full_like(wall().scales, -5.0))
     refinement = refinement_of(tiny_weights, 8.0, small)

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,22 +30,25 @@ from tests.small_scenes import cameras, style, wall, write_files
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 ROOT = Path(__file__).resolve().parents[3]
-FORMS = ("ply", "spz", "scene", "numpy", "splats", "parameters", "activated", "gsplat", "nerfstudio")
 
 
-def in_form(form: str, scene: Scene, folder: Path) -> Any:
-    """Return a scene in one of `FORMS`."""
-    if form in ("ply", "spz"):
-        save(folder / f"scene.{form}", scene)
-        return load_scene(str(folder / f"scene.{form}"))
-    if form in ("gsplat", "nerfstudio"):
-        write = write_gsplat if form == "gsplat" else write_nerfstudio
-        return load_scene(write(folder / "step-29999.ckpt", scene))
-    if form == "numpy":
-        return {key: value.numpy() for key, value in splats_of(scene).items()}
-    if form == "parameters":
-        return torch.nn.ParameterDict(splats_of(scene))
-    return scene if form == "scene" else splats_of(scene, activated=form == "activated")
+def saved(path: Path, scene: Scene) -> Any:
+    save(path, scene)
+    return load_scene(str(path))
+
+
+#: Functions that return a scene in one form, given a folder for files.
+FORMS: dict[str, Callable[[Scene, Path], Any]] = {
+    "ply": lambda scene, folder: saved(folder / "scene.ply", scene),
+    "spz": lambda scene, folder: saved(folder / "scene.spz", scene),
+    "scene": lambda scene, folder: scene,
+    "numpy": lambda scene, folder: {key: value.numpy() for key, value in splats_of(scene).items()},
+    "splats": lambda scene, folder: splats_of(scene),
+    "parameters": lambda scene, folder: torch.nn.ParameterDict(splats_of(scene)),
+    "activated": lambda scene, folder: splats_of(scene, activated=True),
+    "gsplat": lambda scene, folder: load_scene(write_gsplat(folder / "step-29999.ckpt", scene)),
+    "nerfstudio": lambda scene, folder: load_scene(write_nerfstudio(folder / "step-29999.ckpt", scene)),
+}
 
 
 def run(scene: Any, weights: BackboneWeights, **settings: Any) -> Any:
@@ -64,7 +68,7 @@ def copied(scene: Scene) -> Scene:
 def test_result_has_the_form_of_the_scene_and_new_colors(
     tiny_weights: BackboneWeights, tmp_path: Path, form: str
 ) -> None:
-    given = in_form(form, wall(sh_degree=1), tmp_path)
+    given = FORMS[form](wall(sh_degree=1), tmp_path)
     before = as_scene(given)
     unchanged = copied(before)
     result = run(given, tiny_weights)
@@ -89,7 +93,7 @@ def test_split_and_attenuated_results_have_the_form_of_the_scene(
 ) -> None:
     scene = large_wall()
     scene = replace(scene, sh_rest=0.1 * torch.ones(len(scene), 3, 3))
-    given = in_form(form, scene, tmp_path)
+    given = FORMS[form](scene, tmp_path)
     if isinstance(given, dict):
         given["label"] = np.arange(len(scene))
     before = as_scene(given)

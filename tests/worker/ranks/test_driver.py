@@ -173,23 +173,25 @@ def test_scene_memory_is_its_decompressed_size() -> None:
     assert memory_beside_gpus(4, 5 * GB) == 22 * GB, "ranks of a machine share the scene"
 
 
-def test_ranks_of_a_machine_request_memory_for_a_shared_scene() -> None:
-    nodes = [{"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}, {"CPU": 64.0, "memory": 500.0 * GB}]
-    assert _bundle(nodes, 1, 8, 5 * GB) == {"CPU": 8, "GPU": 1, "memory": 13 * GB}
-    assert _bundle(nodes, 2, 8, 5 * GB) == {"CPU": 8, "GPU": 1, "memory": 8 * GB}
-    assert _bundle([*nodes, nodes[0]], 8, 8, 5 * GB)["memory"] == 5.5 * GB, "four on each machine"
+GPUS, MANY_CORES = {"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}, {"CPU": 64.0, "memory": 500.0 * GB}
 
 
-def test_oversized_scene_requests_a_whole_machines_memory() -> None:
-    nodes = [{"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}]
-    assert _bundle(nodes, 1, 8, 200 * GB)["memory"] == 100 * GB
-    assert _bundle(nodes, 4, 8, 200 * GB)["memory"] == 25 * GB
-
-
-def test_only_cores_are_requested_without_gpus() -> None:
-    """Without GPUs, plans already limit their memory to a fraction of the machine's, so only cores are requested."""
-    assert _bundle([{"CPU": 32.0, "memory": 100.0 * GB}], 2, 8, 5 * GB) == {"CPU": 8}
-    assert _bundle([{"CPU": 32.0, "GPU": 4.0}], 2, 8, 5 * GB) == {"CPU": 8, "GPU": 1}, "Ray knows of no memory"
+@pytest.mark.parametrize(
+    ("nodes", "ranks", "scene", "resources"),
+    [
+        ([GPUS, MANY_CORES], 1, 5 * GB, {"GPU": 1, "memory": 13 * GB}),
+        ([GPUS, MANY_CORES], 2, 5 * GB, {"GPU": 1, "memory": 8 * GB}),
+        ([GPUS, MANY_CORES, GPUS], 8, 5 * GB, {"GPU": 1, "memory": 5.5 * GB}),  # four on each machine
+        ([GPUS], 1, 200 * GB, {"GPU": 1, "memory": 100 * GB}),  # a whole machine's
+        ([GPUS], 4, 200 * GB, {"GPU": 1, "memory": 25 * GB}),
+        ([{"CPU": 32.0, "memory": 100.0 * GB}], 2, 5 * GB, {}),  # plans limit their memory already
+        ([{"CPU": 32.0, "GPU": 4.0}], 2, 5 * GB, {"GPU": 1}),  # Ray knows of no memory
+    ],
+)
+def test_ranks_request_cores_gpus_and_memory_for_a_shared_scene(
+    nodes: list[dict[str, float]], ranks: int, scene: int, resources: dict[str, float]
+) -> None:
+    assert _bundle(nodes, ranks, 8, scene) == {"CPU": 8, **resources}
 
 
 @contextmanager
