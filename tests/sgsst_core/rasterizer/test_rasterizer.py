@@ -46,7 +46,7 @@ from tests.sgsst_core.splat_scenes import (
 
 #: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
-#: Rasterizers of the CPU; `test_triton_cached.py` compares `cached`, which runs in Triton's interpreter here.
+#: Rasterizers of the CPU; `test_triton.py` compares `cached`, which runs in Triton's interpreter here.
 ALL = [name for name, kind in RASTERIZERS.items() if not kind.on_gpu and name != "cached"]
 OTHERS = [name for name in ALL if name != "reference"]
 BLACK = (0.0, 0.0, 0.0)
