@@ -25,8 +25,8 @@ from sgsst_core.stylizing.color_transfer import (
 )
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer, render_first_view
-from tests.sgsst_core.stylizing.test_stylized_regions import halves
 from tests.sgsst_core.synthetic_images import synthetic_image
+from tests.sgsst_core.test_regions import halves
 from tests.small_scenes import cameras, style, wall
 
 Start = Callable[[Tensor, Tensor, Style], Tensor]
