@@ -1,20 +1,47 @@
-"""Tests of refining a scene of large Gaussians: images hardly change, and only large Gaussians are split."""
+"""Tests of refining a scene: which Gaussians are split, their children, and that images hardly change."""
 
+import math
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
 
-from sgsst_core import refine as choice
+from sgsst_core import refine as module
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.survey import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.refine import MIN_PSNR, Footprints, Refinement, parents_of, piece_counts
+from sgsst_core.refine import (
+    MAX_PIECES,
+    MIN_PSNR,
+    SIZES,
+    STROKE_SIZE,
+    Footprints,
+    Refinement,
+    can_be_split,
+    choose_pieces,
+    finest_size,
+    max_children,
+    mixture_error,
+    parents_of,
+    piece_counts,
+    ratio_of,
+    refine_decision,
+    split,
+    split_axis,
+)
 from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.colors import luminance
-from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene, unit_rotations
+from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from sgsst_core.settings import Settings, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing import refining
@@ -23,7 +50,7 @@ from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.refining import disagreement, refine, render
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights as make_tiny_weights
-from tests.sgsst_core.splat_scenes import camera, cloud
+from tests.sgsst_core.splat_scenes import camera, cloud, single
 from tests.small_scenes import cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -44,13 +71,13 @@ def large_wall() -> Scene:
     return Scene(*(torch.cat([getattr(part, name) for part in (behind, before)]) for name in TENSORS))
 
 
-def settings(**values: object) -> Settings:
+def refine_settings(**values: object) -> Settings:
     return make_settings("preview", steps_coarse=0, steps_sos=2, measure=0, **values)
 
 
 def refinement_of(weights: BackboneWeights, factor: float, scene: Scene | None = None) -> Refinement:
     refinement = refine(
-        JobInputs(scene or large_wall(), cameras(), Style.of(style()), settings(refine=factor), weights=weights)
+        JobInputs(scene or large_wall(), cameras(), Style.of(style()), refine_settings(refine=factor), weights=weights)
     )
     assert refinement is not None
     return refinement
@@ -108,16 +135,18 @@ def test_nothing_is_split_if_no_gaussian_is_large(tiny_weights: BackboneWeights)
 
 def test_auto_splits_only_what_is_too_large_for_strokes(tiny_weights: BackboneWeights) -> None:
     scene, views = large_wall(), cameras()
-    refinement = refine(JobInputs(scene, views, Style.of(style()), settings(refine="auto"), weights=tiny_weights))
+    refinement = refine(
+        JobInputs(scene, views, Style.of(style()), refine_settings(refine="auto"), weights=tiny_weights)
+    )
     assert refinement is not None
     assert refinement.size is not None
-    assert refinement.size >= choice.STROKE_SIZE
+    assert refinement.size >= module.STROKE_SIZE
     assert len(scene) < refinement.gaussians <= 2 * len(scene)
     prints, rasterizer = Footprints(scene), CpuRasterizer(scene)
     for view in views:
         prints.add(view, rasterizer.survey(view)[1])
     split = piece_counts(refinement.pieces) > 1
-    assert float(prints.lengths[split].amax(dim=1).min()) > choice.STROKE_SIZE
+    assert float(prints.lengths[split].amax(dim=1).min()) > module.STROKE_SIZE
 
 
 def test_splits_that_would_change_the_image_are_undone(
@@ -128,7 +157,7 @@ def test_splits_that_would_change_the_image_are_undone(
     refinement = refinement_of(tiny_weights, 4.0)
     assert refinement.split == 0
     assert refinement.reverted > 0
-    assert "are not split" in choice.refine_decision(refinement, settings(refine=4)).reason
+    assert "are not split" in module.refine_decision(refinement, refine_settings(refine=4)).reason
     monkeypatch.setattr(refining, "MIN_PSNR", 0.0)
     loose = refinement_of(tiny_weights, 4.0)
     assert (loose.reverted, loose.split) == (0, refinement.reverted)
@@ -136,7 +165,7 @@ def test_splits_that_would_change_the_image_are_undone(
 
 def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> None:
     scene = large_wall()
-    stylizer = Stylizer.planned(scene, cameras(), style(), settings(refine=3), weights=tiny_weights)
+    stylizer = Stylizer.planned(scene, cameras(), style(), refine_settings(refine=3), weights=tiny_weights)
     refinement = stylizer.job.plan.refinement
     assert refinement is not None
     assert len(stylizer.job.scene) == refinement.gaussians > len(scene)
@@ -153,7 +182,7 @@ def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> N
 def test_refinement_reports_its_progress(tiny_weights: BackboneWeights) -> None:
     reports: list[tuple[str, int, int]] = []
     refine(
-        JobInputs(large_wall(), cameras(), Style.of(style()), settings(refine=2.0), weights=tiny_weights),
+        JobInputs(large_wall(), cameras(), Style.of(style()), refine_settings(refine=2.0), weights=tiny_weights),
         show=lambda now: reports.append((now.stage, now.step, now.total)),
     )
     stages = [(stage, done, 3) for stage in ("planning", "refining") for done in range(3)]
@@ -164,7 +193,7 @@ def on_a_rank(collectives: Collectives, factor: float) -> Refinement | None:
     """Refine the wall on one of several ranks, each of which runs this function in its own process."""
     weights = make_tiny_weights()
     return refine(
-        JobInputs(large_wall(), cameras(), Style.of(style()), settings(refine=factor), weights=weights),
+        JobInputs(large_wall(), cameras(), Style.of(style()), refine_settings(refine=factor), weights=weights),
         collectives=collectives,
     )
 
@@ -219,3 +248,211 @@ def test_all_controls_work_together(tiny_weights: BackboneWeights) -> None:
     assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
     assert float(luminance(change).abs().max()) > 0.01
     assert torch.equal(stylized(job(tiny_weights, **values)), stylized_colors)
+
+
+NUMBERS = [1, *range(3, MAX_PIECES + 1)]
+
+
+def covariances(scene: Scene) -> Tensor:
+    """Return covariances [N, 3, 3] in float64."""
+    factors = (
+        unit_rotations(torch.nn.functional.normalize(scene.quats.double())) * scene.scales.double().exp()[:, None, :]
+    )
+    return factors @ factors.transpose(1, 2)
+
+
+def mixtures(children: Scene, parents: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return opacity-weighted mean [N, 3] and covariance [N, 3, 3] of each parent's children, in float64."""
+    opacity = torch.sigmoid(children.opacities.double())
+    fraction = opacity / torch.zeros(count, dtype=torch.float64).index_add(0, parents, opacity)[parents]
+    mean = torch.zeros(count, 3, dtype=torch.float64).index_add(0, parents, fraction[:, None] * children.means.double())
+    apart = children.means.double() - mean[parents]
+    own = covariances(children) + apart[:, :, None] * apart[:, None, :]
+    return mean, torch.zeros(count, 3, 3, dtype=torch.float64).index_add(0, parents, fraction[:, None, None] * own)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_split_axis_has_the_parents_variance_and_nearly_its_density(number: int) -> None:
+    division = split_axis(number)
+    assert len(division.offsets) == len(division.weights) == number
+    assert division.weights.sum() == pytest.approx(1, abs=1e-14)
+    assert division.weights @ division.offsets == pytest.approx(0, abs=1e-12)
+    assert 1 / division.ratio**2 + division.weights @ division.offsets**2 == pytest.approx(1, abs=1e-11)
+    assert division.ratio == ratio_of(number)
+    x = np.linspace(-9, 9, 20001)
+    density = np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
+    parts = (
+        np.exp(-(((x[:, None] - division.offsets) * division.ratio) ** 2) / 2) * division.ratio / math.sqrt(2 * math.pi)
+    )
+    error = np.sqrt(((parts @ division.weights - density) ** 2).sum() / (density**2).sum())
+    assert mixture_error(division) == pytest.approx(error, abs=1e-6)
+    assert error < 0.03
+    # Factor on the opacity of a child, which never exceeds the parent's.
+    assert float((division.weights * division.ratio).max()) <= 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.lists(st.sampled_from(NUMBERS[:8]), min_size=3, max_size=3), st.floats(-8, 2))
+def test_children_have_the_parents_mean_and_covariance(seed: int, numbers: list[int], log_scale: float) -> None:
+    scene = cloud(30, seed=seed, log_scale=log_scale)
+    pieces = torch.tensor(numbers, dtype=torch.uint8).repeat(30, 1)
+    pieces[::3] = 1
+    children, parents = split(scene, pieces), parents_of(pieces)
+    assert len(children) == len(parents) == int(piece_counts(pieces).sum())
+    mean, covariance = mixtures(children, parents, 30)
+    expected = covariances(scene)
+    size = expected.diagonal(dim1=1, dim2=2).sum(1)
+    rounding = 1e-6 * scene.means.abs().amax(1).double()  # of positions stored in float32
+    assert bool(((mean - scene.means).norm(dim=1) < 1e-5 * size.sqrt() + rounding).all())
+    apart = (covariance - expected).flatten(1).norm(dim=1)
+    assert bool((apart < 1e-5 * size + 10 * rounding * size.sqrt() + rounding**2).all())
+
+
+def test_unsplit_gaussians_and_inherited_properties_are_bit_identical(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_CHUNK", 50)
+    scene = cloud(40, degree=2)
+    pieces = torch.ones(40, 3, dtype=torch.uint8)
+    pieces[3], pieces[17], pieces[18, 1] = torch.tensor([5, 4, 1]), torch.tensor([3, 3, 3]), 32
+    children, parents = split(scene, pieces), parents_of(pieces)
+    assert bool((parents[1:] >= parents[:-1]).all())
+    for name in ("quats", "sh_dc", "sh_rest"):
+        assert torch.equal(getattr(children, name), getattr(scene, name)[parents])
+    unsplit = (piece_counts(pieces) == 1)[parents]
+    for name in TENSORS:
+        assert torch.equal(getattr(children, name)[unsplit], getattr(scene, name)[parents][unsplit])
+    monkeypatch.setattr(module, "_CHUNK", 1 << 18)
+    again = split(scene, pieces)
+    assert all(torch.equal(getattr(again, name), getattr(children, name)) for name in TENSORS)
+    assert split(scene, torch.ones(40, 3, dtype=torch.uint8)) is scene
+
+
+def test_extreme_gaussians_have_finite_children_or_are_not_split() -> None:
+    """Cases are needles, points, huge and coincident Gaussians, and opacities of 0 and 1."""
+    count = 9
+    scene = replace(
+        cloud(count, degree=1),
+        means=torch.tensor([[0.0, 0.0, 4.0]]).repeat(count, 1),
+        scales=torch.tensor(
+            [
+                [10.0, -40, -40],
+                [-59.0] * 3,
+                [59.0] * 3,
+                [-1.0] * 3,
+                [-1.0] * 3,
+                [3e38] * 3,
+                [-3e38] * 3,
+                [0.0] * 3,
+                [0.0] * 3,
+            ]
+        ),
+        opacities=torch.tensor([0.0, 0, 0, -3.4e38, 3.4e38, 0, 0, 90, -90]),
+    )
+    scene.quats[7] = 0
+    scene.quats[8] *= 1e-30
+    possible = can_be_split(scene)
+    assert possible.tolist() == [True, True, True, True, True, False, False, False, True]
+    pieces = torch.ones(count, 3, dtype=torch.uint8)
+    pieces[possible] = torch.tensor([4, 3, 5], dtype=torch.uint8)
+    children = split(scene, pieces)
+    for name in TENSORS:
+        assert bool(torch.isfinite(getattr(children, name)).all()), name
+    opacity = torch.sigmoid(children.opacities.double())
+    assert bool((opacity <= torch.sigmoid(scene.opacities.double())[parents_of(pieces)]).all())
+    pieces[5, 0] = 3
+    with pytest.raises(ValueError, match="extreme"):
+        split(scene, pieces)
+
+
+@pytest.mark.parametrize("pieces", [[[2, 1, 1]], [[0, 1, 1]], [[33, 1, 1]], [[1, 1, 1], [1, 1, 1]]])
+def test_invalid_piece_counts_are_refused(pieces: list[list[int]]) -> None:
+    with pytest.raises(ValueError, match="pieces must be"):
+        split(single((0, 0, 3)), torch.tensor(pieces, dtype=torch.uint8))
+
+
+@pytest.mark.parametrize(("opacity", "least"), [(0.1, 45.0), (0.4, 40.0), (0.7, 33.0)])
+def test_split_gaussian_looks_like_its_parent(opacity: float, least: float) -> None:
+    """A single white Gaussian on black is the hardest case, because nothing around it hides a change."""
+    scene = single((0.1, 0, 4.0), opacity=opacity, scales=(0.5, 0.3, 0.02), quat=(0.9, 0.1, 0.1, 0.3))
+    pieces = torch.tensor([[6, 4, 1]], dtype=torch.uint8)
+    images = []
+    for each in (scene, split(scene, pieces)):
+        images.append(ReferenceRasterizer(each).render(torch.ones(len(each), 3), camera()))
+    error = float((images[0] - images[1]).square().mean())
+    assert -10 * math.log10(error) > least
+
+
+def test_children_inherit_stored_harmonics(tmp_path: Path) -> None:
+    write_scene(tmp_path / "scene.ply", cloud(300, degree=3))
+    pieces = torch.ones(300, 3, dtype=torch.uint8)
+    pieces[::7, 1] = 3
+    plain = split(read_scene(tmp_path / "scene.ply").scene, pieces)
+    stored = split(read_scene(tmp_path / "scene.ply", held_bytes=0).scene, pieces)
+    assert isinstance(stored.sh_rest, StoredHarmonics)
+    assert torch.equal(held(stored.sh_rest), held(plain.sh_rest))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.floats(1, 16), st.floats(0.1, 300))
+def test_chosen_pieces_never_exceed_the_budget(seed: int, factor: float, largest: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    count = 50
+    lengths = largest * torch.rand(count, 3, generator=generator, dtype=torch.float64) ** 3
+    allowed = torch.rand(count, generator=generator) > 0.3
+    cancels = torch.rand(count, generator=generator, dtype=torch.float64)
+    most = torch.randint(1, 400, (count,), generator=generator).double()
+    budget = int(factor * count)
+    pieces, size = choose_pieces(lengths, allowed, cancels, most, budget)
+    assert int(piece_counts(pieces).sum()) <= budget
+    assert bool((piece_counts(pieces) <= most).all())
+    assert bool((pieces[~allowed] == 1).all())
+    assert bool((pieces[lengths <= SIZES[-1]] == 1).all())
+    assert (size is None) == (not bool((pieces > 1).any()))
+    again, same = choose_pieces(lengths, allowed, cancels, most, budget)
+    assert torch.equal(again, pieces)
+    assert same == size
+
+
+def test_gaussians_that_disagree_most_are_split_first_within_the_budget() -> None:
+    lengths = torch.tensor([[10.0, 0.1, 0.1]], dtype=torch.float64).repeat(6, 1)
+    weights = torch.full((6,), 1e4, dtype=torch.float64)
+    cancels = torch.tensor([1.0, 5.0, 2.0, 0.5, 4.0, 3.0], dtype=torch.float64)
+    pieces, _ = choose_pieces(lengths, torch.ones(6, dtype=torch.bool), cancels, max_children(weights), 11)
+    assert piece_counts(pieces).tolist() == [1, 3, 1, 1, 3, 1]
+    one, most = torch.ones(1, dtype=torch.bool), max_children(weights[:1])
+    blob, _ = choose_pieces(lengths.new_full((1, 3), 200.0), one, cancels[:1], most, 10**6)
+    assert 200 < int(piece_counts(blob)) <= 1024
+    nothing, size = choose_pieces(
+        torch.full_like(lengths, 1.0), torch.ones(6, dtype=torch.bool), cancels, max_children(weights), 60
+    )
+    assert bool((nothing == 1).all())
+    assert size is None
+
+
+@pytest.mark.parametrize(
+    ("values", "size"),
+    [
+        ({"refine": 4}, SIZES[-1]),
+        ({"refine": "auto"}, STROKE_SIZE),
+        ({"refine": "auto", "scales": (1.0, 0.0, 1.0)}, STROKE_SIZE),
+        ({"refine": "auto", "scales": (0.0, 0.0, 1.0)}, 4 * STROKE_SIZE),
+    ],
+)
+def test_finest_size_is_that_of_the_strokes_of_the_finest_scale(values: dict[str, Any], size: float) -> None:
+    assert finest_size(make_settings(**values)) == size
+
+
+@pytest.mark.parametrize("reverted", [0, 7])
+def test_plan_line_states_splits_and_their_image_error(reverted: int) -> None:
+    pieces = torch.ones(1000, 3, dtype=torch.uint8)
+    pieces[:10, 0] = 5
+    refinement = Refinement(pieces, 10, 1040, 6.5, 43.21, 41.09, reverted)
+    line = refine_decision(refinement, make_settings(refine=4))
+    assert line.decision == "10 are split, which turns 1,000 Gaussians into 1,040"
+    assert "6.5 pixels" in line.reason
+    assert ("7 are not split" in line.reason) == bool(reverted)
+    assert "43.2 dB" in line.error
+    assert "41.1 dB" in line.error
+    automatic = refine_decision(refinement, make_settings(refine="auto"))
+    assert "at most 2 times as many are allowed" in automatic.reason
+    none = refine_decision(Refinement(torch.ones(9, 3, dtype=torch.uint8), 0, 9), make_settings(refine=4))
+    assert none.decision == "none is split"
