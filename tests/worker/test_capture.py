@@ -18,7 +18,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.panorama import FACES
-from sgsst_core.scene.rendering import Rendering
+from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.objects import figure, ground, joined
 from tests.small_scenes import ball, cameras, wall, write_files
@@ -290,23 +290,35 @@ def test_up_direction_determines_axes_of_spz_without_stated_axes_or_cameras(tmp_
         assert choose_axes(source) == ("auto", [])
 
 
-def test_plan_names_render_mode_and_warnings(tmp_path: Path) -> None:
-    path = tmp_path / "scene.ply"
-    write_scene(path, ball())
-    assert about_rendering(read_scene(path)) == []
-    (line,) = about_rendering(read_scene(path).rendered("antialiased", 0.1))
-    assert (line.item, line.decision) == ("rendering", "antialiased, eps2d 0.1")
-    assert line.reason == "as requested; the file states nothing"
-    write_scene(path, replace(ball(), rendering=Rendering("antialiased")))
-    (line,) = about_rendering(read_scene(path))
-    assert line.reason == "the comment 'SplatRenderMode: mip' says so; see --render-mode and --eps2d"
-    (line,) = about_rendering(read_scene(path).rendered("classic", None))
-    assert line.reason == "as requested; the file states antialiased, eps2d 0.3"
-    write_scene(path, replace(ball(), rendering=Rendering("2dgs")))
-    assert [line.decision for line in about_rendering(read_scene(path))] == [
-        "2dgs, eps2d 0.3",
-        "warning: drawn as Gaussians without thickness",
-    ]
+@pytest.mark.parametrize(
+    ("stated", "requested", "decisions", "reason"),
+    [
+        (CLASSIC, None, [], ""),
+        (CLASSIC, ("antialiased", 0.1), ["antialiased, eps2d 0.1"], "as requested; the file states nothing"),
+        (
+            Rendering("antialiased"),
+            None,
+            ["antialiased, eps2d 0.3"],
+            "the comment 'SplatRenderMode: mip' says so; see --render-mode and --eps2d",
+        ),
+        (
+            Rendering("antialiased"),
+            ("classic", None),
+            ["classic, eps2d 0.3"],
+            "as requested; the file states antialiased, eps2d 0.3",
+        ),
+        (Rendering("2dgs"), None, ["2dgs, eps2d 0.3", "warning: drawn as Gaussians without thickness"], None),
+    ],
+)
+def test_plan_names_render_mode_and_warnings(
+    tmp_path: Path, stated: Rendering, requested: Any, decisions: list[str], reason: str | None
+) -> None:
+    write_scene(tmp_path / "scene.ply", replace(ball(), rendering=stated))
+    file = read_scene(tmp_path / "scene.ply")
+    lines = about_rendering(file.rendered(*requested) if requested else file)
+    assert [line.decision for line in lines] == decisions
+    assert reason is None or "".join(line.reason for line in lines) == reason
+    assert {line.item for line in lines} <= {"rendering"}
 
 
 def test_white_background_of_the_run_is_reported(tmp_path: Path) -> None:
@@ -316,7 +328,6 @@ def test_white_background_of_the_run_is_reported(tmp_path: Path) -> None:
     (line,) = about_background(path, BLACK)
     assert line.decision.startswith("warning: the scene was trained on white")
     assert line.reason == f"{tmp_path}/cfg_args has white_background=True; add --background white"
-    assert about_background(path, WHITE) == []
-    assert about_background(tmp_path / "a" / "b" / "scene.ply", BLACK) == []
+    assert about_background(path, WHITE) == about_background(tmp_path / "a" / "b" / "scene.ply", BLACK) == []
     (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3, white_background=False)")
     assert about_background(path, BLACK) == []
