@@ -211,25 +211,28 @@ def test_file_of_another_network_is_refused(folder: Path) -> None:
 
 def test_wrong_state_dicts_are_refused(tmp_path: Path) -> None:
     good = torchvision_state(random_vgg("vgg16"), TORCHVISION_VGG16)
-    cases: list[tuple[object, str]] = [
-        ({"layer1.weight": torch.zeros(1)}, "neither torchvision's"),
-        ([1, 2], "not a state dict"),
-        ({key: value for key, value in good.items() if key != "features.28.bias"}, r"features\.28\.bias is missing"),
-        (good | {"features.5.weight": torch.zeros(128, 64, 1, 1)}, "conv2_1.weight"),
-        (good | {"features.5.bias": torch.full((128,), float("nan"))}, "conv2_1.bias holds NaN"),
-        (good | {"features.5.bias": torch.zeros(0)}, "conv2_1.bias"),
+    cases: list[tuple[str, object, str]] = [
+        ("vgg16", {"layer1.weight": torch.zeros(1)}, "neither torchvision's"),
+        ("vgg16", [1, 2], "not a state dict"),
         (
+            "vgg16",
+            {key: value for key, value in good.items() if key != "features.28.bias"},
+            r"features\.28\.bias is missing",
+        ),
+        ("vgg16", good | {"features.5.weight": torch.zeros(128, 64, 1, 1)}, "conv2_1.weight"),
+        ("vgg16", good | {"features.5.bias": torch.full((128,), float("nan"))}, "conv2_1.bias holds NaN"),
+        ("vgg16", good | {"features.5.bias": torch.zeros(0)}, "conv2_1.bias"),
+        (
+            "vgg16",
             good | {"features.5.weight": torch.zeros(100, 64, 3, 3), "features.5.bias": torch.zeros(100)},
             r"conv2_2\.weight is torch\.float32 \[128, 128, 3, 3\], not float32 \[128, 100, 3, 3\]",
         ),
+        ("vgg19", good, "not vgg19"),
     ]
-    for state, message in cases:
+    for name, state, message in cases:
         torch.save(state, tmp_path / "bad.pth")
         with pytest.raises(WeightsError, match=message):
-            fetch_network_weights("vgg16", source=tmp_path / "bad.pth", folder=tmp_path)
-    torch.save(good, tmp_path / "bad.pth")
-    with pytest.raises(WeightsError, match="not vgg19"):
-        fetch_network_weights("vgg19", source=tmp_path / "bad.pth", folder=tmp_path)
+            fetch_network_weights(name, source=tmp_path / "bad.pth", folder=tmp_path)
     (tmp_path / "bad.pth").write_bytes(b"<html>404</html>")
     with pytest.raises(WeightsError, match="not a file of PyTorch weights"):
         fetch_network_weights("vgg19", source=tmp_path / "bad.pth", folder=tmp_path)

@@ -153,16 +153,13 @@ def coverage_maps(size, count):
     return list((raw / raw.sum(dim=0))[:count])
 
 
-def targets_of(loss, styles, weights):
-    return combined([loss.targets.of_style(Style.of(style), SIZE) for style in styles], weights)
-
-
 def evaluate_regions(network, image, content, styles, maps, weights, **options):
     dtype = network.dtype
     loss = SosLoss(network, coarsest=60, **options)
     view = loss.targets.of_view(content.to(dtype))
     view.regions = [loss.targets.position_weights(share) for share in maps]
-    return loss.evaluate(image.to(dtype), targets_of(loss, [s.to(dtype) for s in styles], weights), view)
+    targets = combined([loss.targets.of_style(Style.of(style.to(dtype)), SIZE) for style in styles], weights)
+    return loss.evaluate(image.to(dtype), targets, view)
 
 
 @pytest.fixture

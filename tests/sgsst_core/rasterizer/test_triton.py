@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -234,13 +233,10 @@ def cached_case(request: pytest.FixtureRequest) -> tuple[Scene, Camera]:
     return CACHED_CASES[request.param]()
 
 
-def cached_on_device(scene: Scene, **options: Any) -> CachedRasterizer:
-    return CachedRasterizer(scene, uncached=on_device(scene), **options)
-
-
 def with_weights(scene: Scene, precision: Precision | None) -> Rasterizer:
     """Return a rasterizer that caches weights in this precision, or recomputes them if it is None."""
-    return on_device(scene) if precision is None else cached_on_device(scene, precision=precision)
+    plain = on_device(scene)
+    return plain if precision is None else CachedRasterizer(scene, uncached=plain, precision=precision)
 
 
 @pytest.fixture(params=[None, *ERRORS])

@@ -11,7 +11,7 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import Settings, make_settings
+from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.color_transfer import (
     _drawn,
@@ -216,12 +216,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def make(
     weights: BackboneWeights, scene: Scene | None = None, regions: Regions | None = None, **values: Any
 ) -> Stylizer:
-    settings = settings_of(**values)
+    settings = make_settings(**{"style_loss": "nnfm", "steps_sos": 6, "early_stop": False, **values})
     return Stylizer.planned(scene or wall(60, 40), cameras(), style(), settings, weights=weights, regions=regions)
-
-
-def settings_of(**values: Any) -> Settings:
-    return make_settings(**{"style_loss": "nnfm", "steps_sos": 6, "early_stop": False, **values})
 
 
 def test_transfer_changes_results_but_not_optimized_colors(tiny_weights: BackboneWeights) -> None:

@@ -57,10 +57,6 @@ def run(scene: Any, weights: BackboneWeights, **settings: Any) -> Any:
     )
 
 
-def copied(scene: Scene) -> Scene:
-    return Scene(*(held(getattr(scene, name)).clone() for name in TENSORS))
-
-
 @pytest.mark.parametrize(
     "form",
     [form if form in ("ply", "numpy", "gsplat") else pytest.param(form, marks=pytest.mark.slow) for form in FORMS],
@@ -70,7 +66,7 @@ def test_result_has_the_form_of_the_scene_and_new_colors(
 ) -> None:
     given = FORMS[form](wall(sh_degree=1), tmp_path)
     before = as_scene(given)
-    unchanged = copied(before)
+    unchanged = Scene(*(held(getattr(before, name)).clone() for name in TENSORS))
     result = run(given, tiny_weights)
     assert type(result) is type(given)
     after, alone = as_scene(result), run(before, tiny_weights)

@@ -257,15 +257,10 @@ def start(arguments: list[str]) -> subprocess.Popen[str]:
     raise AssertionError(process.communicate()[1])
 
 
-def processes_below(process: psutil.Process) -> list[psutil.Process]:
-    """Return all running descendants of a process."""
-    return [child for child in process.children(recursive=True) if child.is_running()]
-
-
 @pytest.mark.slow
 def test_killed_driver_leaves_no_processes_or_files(tmp_path: Path) -> None:
     process = start(command(small_request(tmp_path, STEPS)))
-    family = processes_below(psutil.Process(process.pid))
+    family = [child for child in psutil.Process(process.pid).children(recursive=True) if child.is_running()]
     used = folders(family)
     assert any("RankProcess" in name_of(child) for child in family)
     assert used

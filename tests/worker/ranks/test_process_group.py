@@ -156,10 +156,6 @@ def features(rank: int) -> Tensor:
     return values
 
 
-def numbers(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
 def merge(collectives: Collectives, empty: int | None) -> list[tuple[LayerStatistics, float]]:
     """Merge three statistics at once, of which the second has fewer channels."""
     every = [features(collectives.rank), features(collectives.rank)[..., 1:4], features(collectives.rank)]
@@ -167,7 +163,7 @@ def merge(collectives: Collectives, empty: int | None) -> list[tuple[LayerStatis
         LayerStatistics.zero(values.shape[-1]) if collectives.rank == empty else layer_statistics(values)
         for values in every
     ]
-    merged, added = collectives.all_reduce_statistics(own, numbers(0.5, 1.0, 1.5))
+    merged, added = collectives.all_reduce_statistics(own, torch.tensor([0.5, 1.0, 1.5], dtype=torch.float64))
     return list(zip(merged, added.tolist(), strict=True))
 
 

@@ -54,12 +54,12 @@ def test_single_machine_job_listens_on_loopback_only(tmp_path: Path, tiny_instal
     )
     for daemon in ("raylet", "gcs_server"):
         assert any(daemon in name and addresses for name, addresses in sockets.items()), sockets
-    elsewhere = {name: addresses for name, addresses in sockets.items() if not all(map(_is_loopback, addresses))}
+    elsewhere = {
+        name: addresses
+        for name, addresses in sockets.items()
+        if not all(ip_address(each).is_loopback for each in addresses)
+    }
     assert elsewhere == {}
-
-
-def _is_loopback(address: str) -> bool:
-    return ip_address(address).is_loopback
 
 
 def own_sockets(collectives: Collectives) -> list[str]:
