@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import pytest
 import torch
+from torch import Tensor
 
 from sgsst_core.budget import Cache
 from sgsst_core.features.network_weights import BackboneWeights
@@ -87,6 +88,23 @@ def test_every_view_is_visited_once_per_round(tiny_weights: BackboneWeights, sce
     rounds = [[record.view for record in stylizer.history[i : i + 4]] for i in (0, 4, 8)]
     assert [sorted(views) for views in rounds] == [[0, 1, 2, 3]] * 3
     assert len({tuple(views) for views in rounds}) > 1
+
+
+def test_learning_rate_falls_exponentially_to_its_end(
+    tiny_weights: BackboneWeights, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stylizer = make(tiny_weights, scene, steps_sos=5, learning_rate=0.1, learning_rate_end=0.001)
+    rates = []
+    update = stylizer._optimizer.update
+
+    def noted(gradient: Tensor, learning_rate: float) -> Tensor:
+        rates.append(learning_rate)
+        return update(gradient, learning_rate)
+
+    monkeypatch.setattr(stylizer._optimizer, "update", noted)
+    while stylizer.step < stylizer.job.total_steps:
+        stylizer.run_step()
+    assert rates == pytest.approx([0.1, 0.1**1.5, 0.01, 0.1**2.5, 0.001])
 
 
 def test_loss_halves_and_falls_on_unused_views(tiny_weights: BackboneWeights, scene: Scene) -> None:
