@@ -105,7 +105,7 @@ def test_commands_run_once_and_are_evaluated(
     monkeypatch.setattr(error_time, "RESOLUTION", 96)
     monkeypatch.setitem(error_time.ALL_SCENES, "wall", ("scene.ply", "cameras.json"))
     for way, steps in (("preview", "2"), ("standard", "9")):
-        monkeypatch.setitem(error_time.WAYS, way, ("--steps-coarse", "0", "--steps-sos", steps))
+        monkeypatch.setitem(error_time.EVERY_WAY, way, ("--steps-coarse", "0", "--steps-sos", steps))
     run(tmp_path, "wall, noise", ["preview", "standard"], [0])
     first = (tmp_path / "error_time.json").read_text()
     rows = stored()["wall, noise"]
