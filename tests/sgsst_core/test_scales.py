@@ -82,8 +82,8 @@ def test_invalid_weights_are_refused(values: tuple[float, ...]) -> None:
 
 def test_scales_beyond_those_of_the_views_are_refused() -> None:
     views = cameras(2, 128, 96)
-    for values, coarsest in (((1.0, 0.0, 0.5), 24), ((1.0, 0.0, 0.0, 0.0), 96), ((), 96)):
-        check_scales(values, views, coarsest)
+    for usable, coarsest in (((1.0, 0.0, 0.5), 24), ((1.0, 0.0, 0.0, 0.0), 96), ((), 96)):
+        check_scales(usable, views, coarsest)
     for values, given, coarsest, message in (
         ((1.0, 0.0, 0.5, 1.0), views, 24, "gives scale 3 a weight, but the views have 3 scales, 0 to 2"),
         ((0.0, 1.0), views, 96, "gives scale 1 a weight, but the views have one scale, 0"),

@@ -37,8 +37,12 @@ def test_add_on_in_blender(service: Service, files: tuple[Path, Path, Path], tmp
     assert "'missing.png'" in answer["no style"]
     assert "Stanford PLY" in answer["cube"]
     assert any("left" in text for text in answer["progress"])
-    expected = {"canceled": "The job was canceled.", "object": "Painted scene stylized.", "moved": [1, 2, 3]}
-    expected |= {"unchanged": True, "points": True, "points can be stylized": True, "points shown": True}
+    expected = {
+        "canceled": "The job was canceled.",
+        "object": "Painted scene stylized.",
+        "moved": [1, 2, 3],
+        **dict.fromkeys(("unchanged", "points", "points can be stylized", "points shown"), True),
+    }
     assert {name: answer[name] for name in (*expected, "timer")} == {**expected, "timer": False}
     with service.client() as client:
         jobs = client.get("/v1/jobs").json()["jobs"]
