@@ -45,7 +45,6 @@ RUNS = runs_of(
 )
 
 
-@pytest.mark.skipif(not stored(), reason="not measured yet in this form")
 @pytest.mark.parametrize("document", ["README.md", "docs/performance.md"])
 def test_documents_show_the_stored_results(document: str) -> None:
     pairs = {pair: runs_of(rows) for pair, rows in stored().items()}
