@@ -6,7 +6,7 @@ python -m benchmarks.error_time show [--figure FILE.png]
 `run` needs a folder with scenes/ and styles/. Each way (`WAYS`) is a process of its own, timed from its start to its
 last file. All ways of a pair get the same cameras, and each result is evaluated on all of them at their full size: by
 the float32 loss of all scales that `standard` minimizes, relative to the unstylized scene, and on novel views by
-AlexNet. What is stored for the same code is not run again. Everything takes about five hours on two cores.
+AlexNet. What is stored for the same code is not run again. Everything takes about six hours on two cores.
 
 `show` prints a small table of means over pairs, a table of each pair, and two lists. A way is above the lower envelope
 if another one, which takes no more seconds, leaves a loss that is lower by more than 5 %. Seconds in which the next
@@ -77,7 +77,7 @@ BUDGETS = [way for way in WAYS if way.startswith("within")]
 #: Presets that minimize the same loss, each with the next better one.
 BETTER = {"preview": "standard"}
 PRESETS: tuple[PresetName, ...] = ("preview", "standard", "paper")
-#: Cameras of a pair, and the longer side of their views: two scales.
+#: Cameras of a pair, and the longer side of views of 4:3, which have two scales; others have as many pixels.
 VIEWS, RESOLUTION = 12, 720
 #: Factor by which a loss may exceed the lower envelope.
 TOLERANCE = 1.05

@@ -22,9 +22,8 @@ T = TypeVar("T")
 
 #: Longer sides in pixels are multiples of `_STEP`, and at least `_LEAST_SIDE`.
 _STEP, _LEAST_SIDE = 32, 96
-#: Fraction and number of the steps of phase 2 that are worth more than larger views. After 42 to 51 s of one core, 40
-#: steps at 384 pixels, 80 to 100 at 256, and 160 at 160 leave 0.183, 0.210 and 0.245 of the loss of 12 views (Massa),
-#: and 0.42, 0.41 and 0.50 (plush).
+#: Fraction of the steps, and number of steps of phase 2, that are worth more than larger views (docs/quality.md, "Why
+#: the defaults are what they are").
 _ENOUGH, _ENOUGH_STEPS = 0.25, 60
 #: Time of a step of phase 1 relative to one on all scales, if there are several.
 _COARSE = 0.5
