@@ -50,13 +50,14 @@ class Pace:
     """Speed of passes on a machine.
 
     Attributes:
-        rate: Pixels through the network, forward and backward, that a rank processes per second.
+        rate: Function that returns how many pixels pass through the network, forward and backward, per second, given
+            those of a step; small steps are slower.
         view: Seconds of the rasterizer's pass over a view.
         pixels: Pixels of these views, mean.
         portion: Fraction of a view's pixels that pass through the network.
     """
 
-    rate: float
+    rate: Callable[[float], float]
     view: float = 0.0
     pixels: float = 1.0
     portion: float = 1.0
@@ -67,7 +68,7 @@ class Pace:
 
     def step(self, network: float, pixels: float, views: float = 1.0) -> float:
         """Return the seconds of a step, given its pixels through the network, and those of each of its views."""
-        return network / self.rate + _RASTER_PASSES * views * self.survey(pixels)
+        return network / self.rate(network) + _RASTER_PASSES * views * self.survey(pixels)
 
 
 @dataclass(frozen=True)

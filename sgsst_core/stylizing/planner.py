@@ -13,9 +13,11 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from statistics import median
 
+import numpy as np
 import torch
 
 from sgsst_core.budget import memory_for
@@ -36,7 +38,6 @@ from sgsst_core.planning.facts import (
     count_intersections,
     count_weights,
     equip,
-    evaluated_pixels,
 )
 from sgsst_core.planning.plan import Plan, choose_precision, is_weighted, make_plan, with_groups
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
@@ -128,9 +129,10 @@ def choose_within(inputs: JobInputs, left: SecondsLeft, collectives: Collectives
     fitted, weights = fit_cameras(inputs.cameras, settings), weights_for(inputs.weights, settings)
     small = [resized(each, min(_SMALL_SIDE, each.side)) for each in spread(fitted, _SMALL_VIEWS)]
     context = equip(inputs.scene, small, settings, weights, collectives, inputs.rasterizer)
-    precision = choose_precision(settings, context.machine)
+    precision, ranks = choose_precision(settings, context.machine), collectives.size
 
     def choice() -> TimeChoice:
+        rates = Rates(context.network(precision), precision, settings)
         context.rasterizer.survey(small[0])  # the first pass starts libraries and compiles kernels
         context.rasterizer.forget_views()
         started = time.perf_counter()
@@ -139,10 +141,8 @@ def choose_within(inputs: JobInputs, left: SecondsLeft, collectives: Collectives
         areas = [camera.width * camera.height for camera in small]
         weighted = is_weighted(survey, settings)
         passed = [survey.regions[index].pixels if weighted else areas[index] for index in survey.covered]
-        pixels = evaluated_pixels(fitted, settings)[0] * settings.views_per_step / collectives.size
-        rate = collectives.size * Rates(context.network(precision), precision, settings).rate(pixels)
         portion = sum(passed) / sum(areas[index] for index in survey.covered)
-        pace = Pace(rate, seconds, sum(areas) / len(areas), portion)
+        pace = Pace(lambda pixels: ranks * rates.rate(pixels / ranks), seconds, sum(areas) / len(areas), portion)
         return choose(fitted, settings, pace, left(), len(inputs.scene))
 
     return collectives.broadcast(choice)
@@ -235,10 +235,10 @@ def estimate(job: StylizationJob) -> Estimate:
     """Estimate the seconds of a job from the rate that earlier jobs have left behind, and from its survey."""
     plan, settings, cameras = job.plan, job.settings, [job.views.cameras[index] for index in job.views.covered]
     pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
-    pace = Pace(Rates(job.network, plan.precision, settings).rate(plan.work.sos), job.survey_seconds, pixels)
+    pace = Pace(Rates(job.network, plan.precision, settings).rate, job.survey_seconds, pixels)
     views = settings.views_per_step / plan.ranks
     sos, coarse = (pace.step(work, pixels, views) for work in (plan.work.sos, plan.work.coarse))
-    measuring = plan.work.measuring / pace.rate
+    measuring = plan.work.measuring / pace.rate(plan.work.sos)
     seconds = plan.steps_coarse * coarse + settings.steps_sos * sos + measuring
     return Estimate(sos, coarse, measuring, ending_seconds(len(job.scene)), min(seconds, settings.within or seconds))
 
@@ -255,9 +255,12 @@ class Rates:
         self._path = cache_folder() / "rates.json"
 
     def rate(self, pixels: float) -> float:
-        """Return the rate of steps with so many pixels: the nearest remembered one, or that of a small image."""
-        own, size = _read(self._path).get(self._key, {}), _size(pixels)
-        return own[min(own, key=lambda known: abs(int(known) - int(size)))] if own else self._tried()
+        """Return the rate of steps with so many pixels, between remembered ones; that of a small image without any."""
+        known = {int(size): rate for size, rate in _read(self._path).get(self._key, {}).items()}
+        sizes = sorted(known)
+        if not sizes:
+            return self._tried
+        return float(np.interp(math.log2(max(pixels, 1.0)), sizes, [known[size] for size in sizes]))
 
     def remember(self, pixels: float, rate: float) -> None:
         """Remember the rate of a job's steps; one that cannot be written is forgotten."""
@@ -268,6 +271,7 @@ class Rates:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_json(self._path, rates)
 
+    @cached_property
     def _tried(self) -> float:
         """Return the rate of one pass over a small image, in less than half a second."""
         settings, seconds = self._settings.model_copy(update={"scales": ()}), 1.0

@@ -405,7 +405,8 @@ def test_memory_bound_grows_with_views_gaussians_and_approximations(machine: Mac
 
 #: 97 views of 1280 pixels, and a pace of 0.1 s per step at 160 pixels.
 VIEWS = [resized(cameras(1)[0], 1280)] * 97
-PACE = Pace(evaluated_pixels([resized(VIEWS[0], 160)], make_settings())[0] / 0.08, 0.01, 160 * 120)
+RATE = evaluated_pixels([resized(VIEWS[0], 160)], make_settings())[0] / 0.08
+PACE = Pace(lambda pixels: RATE, 0.01, 160 * 120)
 
 
 def chosen(seconds: float, settings: Settings | None = None) -> TimeChoice:
@@ -448,6 +449,14 @@ def test_what_more_time_brings_is_more_than_the_steps() -> None:
     assert "; in " not in choice.decision(None, choice.steps_sos).reason
     preview = chosen(10, make_settings("preview", within=10))
     assert (preview.longer_resolution < 511, preview.longer_steps) == (True, 60), "there is one scale, so one phase"
+
+
+def test_slower_small_steps_lower_the_choice_of_small_budgets() -> None:
+    pace = replace(PACE, rate=lambda pixels: RATE * min(1.0, pixels / 4e5))
+    choices = [
+        [choose(VIEWS, make_settings(within=time), each, time, 100) for each in (PACE, pace)] for time in (20, 600)
+    ]
+    assert [slow.resolution < usual.resolution for usual, slow in choices] == [True, False]
 
 
 def test_budget_that_nothing_fits_is_said_to_be_exceeded() -> None:

@@ -392,12 +392,12 @@ def rates(network: FeatureNetwork, precision: PlannedPrecision = "float32") -> R
     return Rates(network, precision, make_settings())
 
 
-def test_rate_of_the_nearest_size_is_remembered_and_merged(cache: Path, network: FeatureNetwork) -> None:
+def test_rates_are_remembered_merged_and_interpolated(cache: Path, network: FeatureNetwork) -> None:
     known = rates(network)
     known.remember(1000, 4.0)
     known.remember(1_000_000, 100.0)
-    actual = [known.rate(pixels) for pixels in (1, 1000, 20_000, 100_000, 1e9)]
-    assert actual == pytest.approx([4.0, 4.0, 4.0, 100.0, 100.0])
+    actual = [known.rate(pixels) for pixels in (1, 1000, 2**15, 2**20, 1e9)]
+    assert actual == pytest.approx([4.0, 4.0, 52.0, 100.0, 100.0])
     known.remember(1000, 16.0)
     assert rates(network).rate(1000) == pytest.approx(8.0), "the geometric mean"
     rates(network, "winograd").remember(1000, 1.0)
