@@ -22,9 +22,9 @@ T = TypeVar("T")
 
 #: Longer sides in pixels are multiples of `_STEP`, and at least `_LEAST_SIDE`.
 _STEP, _LEAST_SIDE = 32, 96
-#: Fraction of the steps, and number of steps of phase 2, that are worth more than larger views (docs/quality.md, "Why
-#: the defaults are what they are").
-_ENOUGH, _ENOUGH_STEPS = 0.25, 60
+#: Fraction of the steps, and number of steps of phase 2, that are worth more than larger views, if the longer side has
+#: `_ENOUGH_SIDE` pixels; proportionally less on smaller views (docs/quality.md, "Why the defaults are what they are").
+_ENOUGH, _ENOUGH_STEPS, _ENOUGH_SIDE = 0.25, 60, 480
 #: Time of a step of phase 1 relative to one on all scales, if there are several.
 _COARSE = 0.5
 #: Passes of the rasterizer in a step, relative to that of the survey.
@@ -171,7 +171,9 @@ class _Estimate:
             sides += reversed(range(min(_LEAST_SIDE, self._side), self._side, _STEP))
         sides = [side for side in sides if self._cost(side)[2] >= len(self._settings.scales)] or sides[:1]
         enough = max(_ENOUGH, min(1.0, _ENOUGH_STEPS / max(self._settings.steps_sos, 1)))
-        side = next((side for side in sides if self._fraction(side, left) >= enough), sides[-1])
+        enough /= _ENOUGH_SIDE
+        fits = (side for side in sides if self._fraction(side, left) >= enough * min(side, _ENOUGH_SIDE))
+        side = next(fits, sides[-1])
         return self._choice(side, self._fraction(side, left))
 
     def has_two_phases(self, side: int) -> bool:

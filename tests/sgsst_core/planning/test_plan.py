@@ -429,11 +429,11 @@ def test_choice_fits_the_budget_and_nearly_uses_it(seconds: float) -> None:
     assert 0.8 * seconds < choice.seconds <= seconds
 
 
-def test_views_are_as_large_as_lets_a_quarter_of_the_steps_fit() -> None:
+def test_views_are_as_large_as_lets_enough_steps_fit() -> None:
     for seconds in (10, 34, 100):
         choice = chosen(seconds)
         assert 96 < choice.resolution < 1280
-        assert 60 <= choice.steps_sos < 120
+        assert 1 <= choice.steps_sos / (60 * min(1, choice.resolution / 480)) < 1.6
         assert not choice.steps_coarse
     assert chosen(1).resolution == 96
     preview = chosen(34, make_settings("preview", within=34))
@@ -448,7 +448,7 @@ def test_what_more_time_brings_is_more_than_the_steps() -> None:
     assert choice.decision(12, choice.longer_steps).reason.endswith(more)
     assert "; in " not in choice.decision(None, choice.steps_sos).reason
     preview = chosen(10, make_settings("preview", within=10))
-    assert (preview.longer_resolution < 511, preview.longer_steps) == (True, 60), "there is one scale, so one phase"
+    assert preview.longer_resolution < 511 and preview.longer_steps <= 60, "there is one scale, so one phase"
 
 
 def test_slower_small_steps_lower_the_choice_of_small_budgets() -> None:
