@@ -126,7 +126,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
 class _Pace:
     """Pace of a job's steps: seconds per pixel that this rank passes through the network.
 
-    Before the first ten steps, it is that of the estimate.
+    Before the first ten steps, it is that of the estimate. The very first one does not count: it prepares the style.
     """
 
     def __init__(self, stylizer: Stylizer) -> None:
@@ -146,11 +146,11 @@ class _Pace:
             least: Number of steps from which on they count instead of the estimate.
         """
         work, expected, history = self._stylizer.job.plan.work, self._estimate, self._stylizer.history
-        start = max(self._first, len(history) - _LATEST)
+        start = max(self._first + 1, len(history) - _LATEST)
         pixels = sum(record.pixels for record in history[start:])
         if len(history) - start < least or not pixels:
             return expected.seconds_coarse if coarse else expected.seconds
-        seconds = history[-1].seconds - (history[start - 1].seconds if start else 0.0)
+        seconds = history[-1].seconds - history[start - 1].seconds
         beside = self._beside / (history[-1].seconds - self._earlier)
         return (work.coarse if coarse else work.sos) * seconds / pixels * (1 + beside)
 

@@ -430,8 +430,8 @@ def test_remaining_time_follows_the_estimate_then_the_own_pace(cache: Path, tiny
     run(stylizer, Callbacks(progress=seen.append, progress_seconds=0))
     left = [progress.eta_s or 0.0 for progress in seen]
     steps = [13 - progress.step for progress in seen]
-    assert left[:9] == pytest.approx([each * expected.seconds + expected.ending for each in steps[:9]], rel=0.02)
-    assert all(0 < each < 0.1 * expected.seconds for each in left[9:])
+    assert left[:10] == pytest.approx([each * expected.seconds + expected.ending for each in steps[:10]], rel=0.02)
+    assert all(0 < each < 0.1 * expected.seconds for each in left[10:])
     (remembered,) = json.loads(cache.read_text()).values()
     assert all(rate > 1 for rate in remembered.values()), "this job's rate is merged"
 
@@ -449,6 +449,22 @@ def test_budget_limits_the_shown_time_and_its_end_leaves_a_rate_behind(
     assert [progress.eta_s for progress in seen] == [100.0, 0.0]
     (remembered,) = json.loads(cache.read_text()).values()
     assert all(rate > 2 for rate in remembered.values())
+
+
+def test_slow_first_step_does_not_end_a_time_budget(
+    cache: Path, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stylizer = Stylizer.planned(
+        wall(10, 8), cameras(2, 32, 24), style(), make_settings("preview", steps_sos=5), weights=tiny_weights
+    )
+    queue_step = stylizer.queue_step
+
+    def queue_with_slow_first_step() -> None:
+        stylizer.seconds += 0 if stylizer.step else 100.0
+        queue_step()
+
+    monkeypatch.setattr(stylizer, "queue_step", queue_with_slow_first_step)
+    assert run(stylizer, Callbacks(left=lambda: 50.0)) == "finished"
 
 
 @pytest.mark.parametrize("stored", ["0", "-1", "NaN", "Infinity"])
