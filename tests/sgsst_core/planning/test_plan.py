@@ -448,7 +448,8 @@ def test_what_more_time_brings_is_more_than_the_steps() -> None:
     assert choice.decision(12, choice.longer_steps).reason.endswith(more)
     assert "; in " not in choice.decision(None, choice.steps_sos).reason
     preview = chosen(10, make_settings("preview", within=10))
-    assert preview.longer_resolution < 511 and preview.longer_steps <= 60, "there is one scale, so one phase"
+    assert preview.longer_resolution < 511
+    assert preview.longer_steps <= 60, "there is one scale, so one phase"
 
 
 def test_slower_small_steps_lower_the_choice_of_small_budgets() -> None:
