@@ -122,14 +122,6 @@ def test_float32_does_not_depend_on_the_partition(tiny_weights, size, tile_sizes
         assert relative_error(tiled.image_gradient, whole.image_gradient) < FLOAT32_TOLERANCE
 
 
-@pytest.mark.parametrize("size", [(1, 1), (15, 17), (16, 16), (3, 200)])
-def test_tiny_views_have_finite_gradients(tiny_weights, size):
-    case = (synthetic_image(*size, seed=1), synthetic_image(40, 30, seed=2), synthetic_image(*size, seed=3), None)
-    result = evaluate(FeatureNetwork(tiny_weights), case, None)
-    assert torch.isfinite(result.image_gradient).all()
-    assert result.image_gradient.abs().max() > 0
-
-
 def test_pixels_far_from_covered_cells_have_zero_gradient(tiny_weights):
     """Pixels beyond the receptive field of every covered cell have zero gradient."""
     size = (400, 300)
@@ -260,21 +252,6 @@ def test_style_gradient_agrees_with_autograd(weighted, dtype, tolerance):
     assert relative_error(gradient.apply(x, a), expected_gradient) < tolerance
 
 
-@pytest.mark.parametrize("dead_in", ["view", "style", "both"])
-def test_dead_channels_give_finite_gradients(dead_in):
-    view, style = make_features(17, 23, 12, 1, torch.float32), make_features(17, 23, 12, 2, torch.float32)
-    for name, x in (("view", view), ("style", style)):
-        if dead_in in (name, "both"):
-            x[..., :5] = 0
-    terms, gradient = style_loss(layer_statistics(view), LayerTarget.of(layer_statistics(style)))
-    result = gradient.apply(view)
-    assert torch.isfinite(result).all()
-    assert float(terms.sum()) > 0
-    if dead_in == "style":
-        _, expected = autograd_style(view, LayerTarget.of(layer_statistics(style)), None)
-        assert relative_error(result, expected) < 1e-5
-
-
 def test_map_about_the_rounded_mean_is_equivalent():
     """It matters if features differ by less than the rounding error of their mean, as in pixels of nearly one color."""
     x, target = nearly_one_color(), LayerTarget.of(layer_statistics(make_features(30, 20, 3, 2)))
@@ -282,16 +259,6 @@ def test_map_about_the_rounded_mean_is_equivalent():
     exact = gradient.apply(x.double())
     assert relative_error(gradient.about_rounded_mean().apply(x), exact) < 1e-5
     assert relative_error(gradient.apply(x), exact) > 1e-3
-
-
-def test_gradient_survives_a_large_mean_to_sigma_ratio():
-    generator = torch.Generator().manual_seed(0)
-    x = (1e4 + torch.randn((60, 50, 8), generator=generator, dtype=torch.float64)).float()
-    style = (1e4 + 2 * torch.randn((60, 50, 8), generator=generator, dtype=torch.float64)).float()
-    target = LayerTarget.of(layer_statistics(style))
-    _, expected = autograd_style(x, target, None)
-    _, gradient = style_loss(layer_statistics(x), target)
-    assert relative_error(gradient.apply(x), expected) < 1e-4
 
 
 @pytest.mark.parametrize("weighted", [False, True])

@@ -213,16 +213,6 @@ def test_view_without_gaussians_is_background(name: str, scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_equal_depths_blend_in_the_order_of_the_file(name: str) -> None:
-    scene = together([((0, 0, 4.0), 0.6, (0.5,) * 3, (1, 0, 0, 0))] * 2)
-    colors = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]])
-    image = make_rasterizer(name, scene).render(colors, camera())
-    assert bool((image[..., 0] >= image[..., 1]).all())
-    assert float(image[..., 0].max()) == pytest.approx(0.6, abs=0.02)
-    assert float(image[..., 1].max()) == pytest.approx(0.24, abs=0.02)
-
-
-@pytest.mark.parametrize("name", ALL)
 def test_gaussian_that_would_saturate_a_pixel_is_not_blended(name: str) -> None:
     """Two opaque Gaussians would leave (1 - 0.99)^2 = TRANSMITTANCE_MIN, so the second one is already skipped."""
     scene = together([((0, 0, z), 0.9999, (50.0,) * 3, (1, 0, 0, 0)) for z in (3.0, 4.0, 5.0)])
