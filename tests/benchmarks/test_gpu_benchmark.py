@@ -11,9 +11,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.gpu import job
 from benchmarks.gpu.__main__ import PARTS
-from benchmarks.gpu.part import QUICK, Findings
 
 pytest.importorskip("triton")
 pytestmark = pytest.mark.slow
@@ -63,23 +61,6 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     assert len(findings["curve"]["losses"]) == len(findings["curve"]["losses_on_the_cpu"]) == 2
     assert findings["curve"]["loss"]["passed"]
     assert findings["ranks"]["colors"]["passed"]
-
-
-def test_job_runs_on_a_simulated_gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    code = (
-        "import sys; from tests import triton_interpreter; from tests.pretend_cuda.runtime import pretend_cuda\n"
-        "from api.cli.main import main\ntriton_interpreter.prepare()\n"
-        "with pretend_cuda(): sys.exit(main(sys.argv[1:]))"
-    )
-    monkeypatch.setattr(job, "PROGRAM", (sys.executable, "-c", code))
-    monkeypatch.setenv("TRITON_INTERPRET", "1")
-    monkeypatch.setattr("benchmarks.gpu.job._PATIENCE", 900)
-    findings = Findings(tmp_path / "findings.json")
-    job.job(QUICK, findings)
-    assert not findings.broken, findings.broken
-    entry = findings.entries["3x32x32"]
-    assert entry["plan"]["prediction"]["device_bytes"] is not None
-    assert sum(entry["seconds_by_part"].values()) == pytest.approx(entry["seconds_total"], abs=0.02)
 
 
 def test_failed_part_reports_reason_and_others_continue(tmp_path: Path) -> None:

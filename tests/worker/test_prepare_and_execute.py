@@ -78,26 +78,6 @@ def test_job_that_ends_early_has_no_steps_left(request_: JobSpec) -> None:
     assert 0 < (after.eta_s or 0) < (step.eta_s or 0)
 
 
-@pytest.mark.slow
-def test_planning_is_shown_and_resume_reuses_the_plan(request_: JobSpec, tmp_path: Path) -> None:
-    whole = small_request(tmp_path / "whole", 8)
-    run_job(prepare(whole))
-    planned: list[Progress] = []
-    first = prepare(request_, show_planning=planned.append)
-    assert [(now.stage, now.step, now.total) for now in planned] == [("planning", done, 3) for done in range(4)]
-    planned.clear()
-    assert run_job(first, steps=3).stopped == "interrupted"
-    second = prepare(request_, resume=Resume(True), show_planning=planned.append)
-    assert not planned, "nothing is surveyed again"
-    assert second.resumed is not None
-    assert (second.resumed.state.step, second.stylizer.job.plan) == (3, second.resumed.plan)
-    assert second.stylizer.job.plan.decisions == first.stylizer.job.plan.decisions
-    assert run_job(second).stopped == "finished"
-    assert request_.out.read_bytes() == whole.out.read_bytes()
-    assert not Path(request_.out).with_name("s.checkpoint.safetensors").exists()
-    assert not Path(request_.out).with_name("s.checkpoint.previous.safetensors").exists()
-
-
 def test_plan_for_another_device_reuses_the_survey(request_: JobSpec) -> None:
     """The checkpoint is that of a job on a GPU that no longer exists."""
     first = prepare(request_)

@@ -16,42 +16,18 @@ from sgsst_core.bench.variants import (
     as_dict,
     choose_variants,
     compare_quality,
-    error_time,
     pareto_front,
     write_plot,
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.judge import Lpips, VggLpips
-from sgsst_core.quality.measure import make_judge, make_novel_views
+from sgsst_core.quality.measure import make_novel_views
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.mark.slow
-def test_variants_are_evaluated_at_equal_times(tiny_weights: BackboneWeights, vgg16_weights: object) -> None:
-    """AlexNet's weights, which judge results, are installed together with VGG16's."""
-    names = ["standard", "coarse-only", "all-scales", "cold-start", "half-weights"]
-    scene, views = wall(), cameras(2, 96, 72)
-    curves = error_time(scene, views, style(), choose_variants(names), 1.0, weights=tiny_weights, coarsest_side=36)
-    assert [curve.variant.name for curve in curves] == names
-    job = Stylizer.planned(scene, views, style(), make_settings(coarsest_side=36), weights=tiny_weights)
-    judge = make_judge(job, make_novel_views(job), Lpips())
-    for curve in curves:
-        assert len(curve.points) == 6
-        assert [point.seconds for point in curve.points] == sorted(point.seconds for point in curve.points)
-        assert curve.points[-1].seconds >= 1.0
-        assert set(curve.points[-1].by_scale) == {0, 1}
-        assert curve.sh_dc is not None
-        assert curve.sh_dc.shape == scene.sh_dc.shape
-        judgments = [point.judgment for point in curve.points]
-        assert all(judgment is not None and judgment.content > 0 for judgment in judgments)
-        assert judgments[-1] == judge.judge(curve.sh_dc)
-    assert (curves[0].points[-1].relative or 1) < 0.9  # it optimizes the loss it is evaluated with
-    assert json.loads(json.dumps(as_dict(curves)))["pareto_front"]
 
 
 def test_pareto_front_contains_undominated_points() -> None:

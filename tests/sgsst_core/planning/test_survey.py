@@ -21,9 +21,8 @@ from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit import OrbitRequest, make_orbit
 from sgsst_core.planning.survey import compare_photos, fitted_psnr, frame_warnings, implausible, shown_by
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene.camera import Camera, resized, spread
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import JobInputs
@@ -185,26 +184,6 @@ def test_real_photos_are_reported_only_if_cropped(shared_data: Path, tmp_path: P
     assert compare_photos(scene, views, cropped, NEAR)[1]
     others = [*photos[1:], photos[0]]
     assert compare_photos(scene, views, others, NEAR)[1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["broche", "playbot_synthetic_sh2"])
-def test_photos_of_scans_may_have_a_background(shared_data: Path, tmp_path: Path, name: str) -> None:
-    """Photos are darker renders at 1024 pixels in front of an image, with noise."""
-    scene = read_scene(scene_path(shared_data, name), drop_invalid=True).scene
-    views = [resized(view, 1024) for view in make_orbit(scene, OrbitRequest(3, None, None, None, NEAR)).cameras]
-    rasterizer = make_rasterizer("cpu", scene, near=NEAR)
-    for view in views:
-        colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, view))
-        behind = synthetic_image(view.height, view.width, seed=3, dtype=torch.float32)
-        photo = rasterizer.render(colors, view) + (1 - rasterizer.coverage(view))[..., None] * behind
-        noise = torch.randn(photo.shape, generator=torch.Generator().manual_seed(4))
-        save_png(tmp_path / f"{view.name}.png", 0.8 * photo + 0.04 * noise)
-    photos = [photo for photo in check_photos(tmp_path, views) if photo]
-    assert compare_photos(scene, views, photos, NEAR)[1] == []
-    for view in views:
-        Image.open(tmp_path / f"{view.name}.png").rotate(180).save(tmp_path / f"{view.name}.png")
-    assert compare_photos(scene, views, photos, NEAR)[1]
 
 
 def reference_psnr(photo: Tensor, render: Tensor, weight: Tensor) -> float:

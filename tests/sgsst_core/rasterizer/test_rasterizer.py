@@ -18,18 +18,16 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.orbit import orbit
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.projection import (
     project,
 )
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
-from sgsst_core.scene.camera import Camera, resized
+from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from tests.real_scenes import scene_path
 from tests.sgsst_core.rasterizer import references as independent
 from tests.sgsst_core.rasterizer.references import assert_background, assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (
@@ -49,7 +47,6 @@ CLOSE = 2e-5
 #: Rasterizers of the CPU; `test_triton.py` compares `cached`, which runs in Triton's interpreter here.
 ALL = [name for name, kind in RASTERIZERS.items() if not kind.on_gpu and name != "cached"]
 OTHERS = [name for name in ALL if name != "reference"]
-BLACK = (0.0, 0.0, 0.0)
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "cloud": lambda: (cloud(), camera()),
@@ -77,7 +74,7 @@ def case(request: pytest.FixtureRequest) -> tuple[Scene, Camera]:
 
 def test_images_and_gradients_agree_with_reference(case: tuple[Scene, Camera]) -> None:
     scene, view = case
-    assert_agree(OTHERS, scene, view, (1.0, 0.25, 0.5))
+    assert_agree(scene, view, (1.0, 0.25, 0.5))
 
 
 def test_survey_equals_coverage_and_gradient_of_ones(case: tuple[Scene, Camera]) -> None:
@@ -96,28 +93,22 @@ def test_survey_equals_coverage_and_gradient_of_ones(case: tuple[Scene, Camera])
         assert float((weights - summed).abs().max()) <= 1e-4 * float(summed.max()) + 2 * int(band.sum())
 
 
-def assert_agree(names: list[str], scene: Scene, view: Camera, background: tuple[float, float, float]) -> int:
-    """Assert that images agree within 1e-4 and gradients within 1e-5, except at pixels very close to a cutoff.
-
-    Return the largest number of differing pixels close to a cutoff.
-    """
+def assert_agree(scene: Scene, view: Camera, background: tuple[float, float, float]) -> None:
+    """Assert that images agree within 1e-4 and gradients within 1e-5, except at pixels very close to a cutoff."""
     colors, pixels = colors_of(scene), pixels_like(view)
     reference = ReferenceRasterizer(scene, background=background)
     band = reference.near_cutoff(view, CLOSE)
     pixels[band] = 0
     image, coverage = reference.render(colors, view), reference.coverage(view)
     expected = reference.color_gradient(pixels, view)
-    flipped = 0
-    for name in names:
+    for name in OTHERS:
         fast = make_rasterizer(name, scene, background=background)
-        flips = assert_close_outside_band(fast.render(colors, view), image, band, tolerance=1e-4)
-        flipped = max(flipped, flips)
+        assert_close_outside_band(fast.render(colors, view), image, band, tolerance=1e-4)
         assert_close_outside_band(fast.coverage(view), coverage, band, tolerance=1e-4)
         actual = fast.color_gradient(pixels, view)
         assert actual.dtype == torch.float32
         assert relative_error(actual, expected) < 1e-5
         assert float((actual - expected).abs().max()) <= 1e-5 * float(expected.abs().max())
-    return flipped
 
 
 def test_reference_agrees_with_a_loop_over_pixels() -> None:
@@ -227,7 +218,7 @@ def test_distant_center_keeps_its_precision() -> None:
     scene = single((-4e6, 0, 4.0), scales=(2e6, 1e-3, 1e-3), opacity=0.9)
     view = camera(64, 16, focal=1e3)
     # The perspective is linearized at the edge of the frustum, so only the agreement matters, not the image.
-    assert_agree(OTHERS, scene, view, BLACK)
+    assert_agree(scene, view, (0.0, 0.0, 0.0))
     assert float(CpuRasterizer(scene).coverage(view).max()) > 0
 
 
@@ -269,25 +260,6 @@ def test_kernels_run_without_a_writable_folder(tmp_path: Path) -> None:
         [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False
     )
     assert finished.returncode == 0, finished.stderr
-
-
-REAL = [("snowmiku_plush", 160), ("broche", 120), ("playbot_synthetic_sh2", 120)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "side"), REAL, ids=[name for name, _ in REAL])
-@pytest.mark.usefixtures("one_thread")
-def test_real_scenes_agree_with_the_reference(shared_data: Path, name: str, side: int) -> None:
-    path = scene_path(shared_data, name)
-    scene = read_scene(path).scene
-    file = path.with_name("cameras.json")
-    views = read_cameras(file) if file.is_file() else orbit(scene, 5)
-    view = resized(views[2], side)
-    background = BLACK if name == "snowmiku_plush" else (1.0, 1.0, 1.0)
-    middle = view.height // 2
-    part = view.cropped(middle - 10, 0, middle + 11, view.width)
-    flipped = assert_agree(OTHERS, scene, part, background)
-    assert flipped <= 1e-3 * 21 * view.width
 
 
 def test_real_scene_looks_like_its_photo(shared_data: Path) -> None:

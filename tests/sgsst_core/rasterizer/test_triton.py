@@ -158,24 +158,6 @@ def test_trial_render_returns_the_reason_of_a_failure(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.slow
-def test_steps_of_a_job_agree_with_the_cpu(tiny_weights: BackboneWeights) -> None:
-    """The whole job uses the rasterizer's protocol: survey, plan, both phases."""
-    # The other tests do not even need pydantic, so they run on a bare machine with a GPU.
-    from sgsst_core.settings import make_settings
-    from sgsst_core.stylizing.stylizer import Stylizer
-    from tests.small_scenes import cameras, style, wall
-
-    settings = make_settings("preview", steps_coarse=1, steps_sos=2, coarsest_side=16)
-    views = cameras(2, 32, 32)  # so small that a step in the interpreter takes only seconds
-    losses = {}
-    for name in ("cpu", "triton"):
-        stylizer = Stylizer.planned(wall(), views, style(), settings, weights=tiny_weights, rasterizer=name)
-        assert stylizer.job.views.rasterizer.name == stylizer.job.plan.rasterizer == name
-        losses[name] = [stylizer.run_step().loss for _ in range(3)]
-    assert losses["triton"] == pytest.approx(losses["cpu"], rel=1e-4)
-
-
-@pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_error_without_a_gpu_gives_advice() -> None:
     with pytest.raises(SettingsError, match="PyTorch sees no GPU"):

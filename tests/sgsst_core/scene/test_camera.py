@@ -541,11 +541,6 @@ def test_sampled_faces_match_a_loop_over_pixels() -> None:
         assert np.abs(undistort(photo, face).numpy() - expected).max() < 1e-5
 
 
-def test_panorama_of_faces_has_neither_offset_nor_seams() -> None:
-    images = [rays(face).float() for face in faces_to_render(POSE, 512)]
-    assert float((join_faces(images, 512) - directions(512)).abs().max()) < 1e-4
-
-
 def test_joined_faces_match_a_loop_over_pixels() -> None:
     width, generator = 48, torch.Generator().manual_seed(2)
     faces = faces_to_render(POSE, width)

@@ -12,7 +12,7 @@ from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.judge import saturated
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.regions import Region, Regions
+from sgsst_core.regions import Regions
 from sgsst_core.scene.colors import LARGEST, gray, luminance, resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
@@ -103,13 +103,11 @@ def test_changed_colors_stay_in_the_range_of_screens(
         assert bool(changed.all())
 
 
-def test_luminance_mode_preserves_chroma_within_the_bounds(tiny_weights: BackboneWeights) -> None:
+def test_luminance_mode_stays_in_the_range_of_screens_if_the_chroma_fits(tiny_weights: BackboneWeights) -> None:
     scene = wall(60, 40)
     stylizer = make(tiny_weights, scene, bounded=True, preserve_colors="luminance")
     run(stylizer)
     stylized = stylizer.stylized()
-    change = (stylized - scene.sh_dc).double()
-    assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < 1e-6
     fits = scene.sh_dc.amax(dim=1) - scene.sh_dc.amin(dim=1) < 2 * LARGEST * (1 - 1e-5)
     assert bool(fits.any())
     assert saturated(stylized[fits]) == 0
@@ -155,19 +153,6 @@ def test_colors_stay_in_the_subspace(
     assert distance_from(image, stylized[inside], axes) < 1e-5
     assert saturated(stylized) == 0
     assert distance_from(image, free.stylized(), axes) > 0.02
-
-
-def test_frozen_gaussians_may_be_out_of_range(tiny_weights: BackboneWeights) -> None:
-    scene = bright_wall()
-    right = (scene.means[:, 0] > 0).to(torch.uint8)
-    regions = Regions((Region("rest"), Region("right", freeze=True)), right)
-    stylizer = make(tiny_weights, scene, regions, bounded=True)
-    run(stylizer)
-    stylized = stylizer.stylized()
-    frozen = regions.frozen
-    assert saturated(scene.sh_dc[frozen]) > 0.1
-    assert torch.equal(stylized[frozen].view(torch.int32), scene.sh_dc[frozen].view(torch.int32))
-    assert saturated(stylized[~frozen]) == 0
 
 
 def adam(start: Tensor, gradients: list[Tensor], rate: float) -> Tensor:

@@ -34,7 +34,6 @@ from sgsst_core.refine import (
     parents_of,
     piece_counts,
     ratio_of,
-    refine_decision,
     split,
     split_axis,
 )
@@ -439,20 +438,3 @@ def test_gaussians_that_disagree_most_are_split_first_within_the_budget() -> Non
 )
 def test_finest_size_is_that_of_the_strokes_of_the_finest_scale(values: dict[str, Any], size: float) -> None:
     assert finest_size(make_settings(**values)) == size
-
-
-@pytest.mark.parametrize("reverted", [0, 7])
-def test_plan_line_states_splits_and_their_image_error(reverted: int) -> None:
-    pieces = torch.ones(1000, 3, dtype=torch.uint8)
-    pieces[:10, 0] = 5
-    refinement = Refinement(pieces, 10, 1040, 6.5, 43.21, 41.09, reverted)
-    line = refine_decision(refinement, make_settings(refine=4))
-    assert line.decision == "10 are split, which turns 1,000 Gaussians into 1,040"
-    assert "6.5 pixels" in line.reason
-    assert ("7 are not split" in line.reason) == bool(reverted)
-    assert "43.2 dB" in line.error
-    assert "41.1 dB" in line.error
-    automatic = refine_decision(refinement, make_settings(refine="auto"))
-    assert "at most 2 times as many are allowed" in automatic.reason
-    none = refine_decision(Refinement(torch.ones(9, 3, dtype=torch.uint8), 0, 9), make_settings(refine=4))
-    assert none.decision == "none is split"

@@ -198,11 +198,6 @@ def make(weights: BackboneWeights, scene: Scene, **values: Any) -> Stylizer:
     return Stylizer.planned(scene, cameras(), style(), settings, weights=weights)
 
 
-def line(stylizer: Stylizer) -> str:
-    (decision,) = (each for each in stylizer.job.plan.decisions if each.item == "spherical harmonics")
-    return f"{decision.decision}: {decision.reason}"
-
-
 @pytest.mark.parametrize("attenuation", [0.4, 1.0])
 def test_job_is_bit_identical_to_that_of_an_attenuated_scene(tiny_weights: BackboneWeights, attenuation: float) -> None:
     scene = wall(sh_degree=2)
@@ -241,11 +236,3 @@ def test_written_result_renders_as_optimized(
             for each in (stylizer, again)
         ]
         assert torch.equal(*images)
-
-
-def test_plan_describes_the_attenuation(tiny_weights: BackboneWeights) -> None:
-    assert "there is nothing to attenuate" in line(make(tiny_weights, wall(), sh_attenuation=0.5))
-    assert "multiplied by 0.75" in line(make(tiny_weights, wall(sh_degree=1), sh_attenuation=0.25))
-    out = make(tiny_weights, wall(sh_degree=1), sh_attenuation=1)
-    assert "attenuated to 0, in the result too; no view directions are computed" in line(out)
-    assert out.job.views.scene.sh_degree == 0

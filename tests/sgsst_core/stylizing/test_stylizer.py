@@ -14,9 +14,7 @@ from sgsst_core.budget import Cache
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.files.images import Color
-from sgsst_core.loss.sos import SosLoss
 from sgsst_core.progress import Progress
-from sgsst_core.quality.measure import Difference
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scales import smoothed
 from sgsst_core.scene.colors import downscale
@@ -183,18 +181,6 @@ def test_phase_1_is_skipped_with_one_scale(
     assert (stylizer.job.plan.steps_coarse, stylizer.job.total_steps) == (phase_1, phase_1 + 5)
 
 
-def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(tiny_weights: BackboneWeights) -> None:
-    settings = make_settings(steps_coarse=1, steps_sos=1)
-    stylizer = Stylizer.planned(wall(), cameras(1, width=512, height=512), style(), settings, weights=tiny_weights)
-    run(stylizer)
-    first, second = stylizer.history
-    assert (first.stage, list(first.terms)) == ("coarse", [1])
-    assert (second.stage, sorted(second.terms)) == ("sos", [0, 1])
-    assert first.loss == first.terms[1].total
-    assert second.loss == pytest.approx((second.terms[0].total + second.terms[1].total) / 2)
-    assert second.terms[1].total < first.terms[1].total
-
-
 @pytest.mark.parametrize(
     ("make_scene", "preset", "values", "weighted"),
     [
@@ -318,43 +304,12 @@ def test_losses_are_measured_on_the_fixed_background(tiny_weights: BackboneWeigh
 # --- whole runs ----------------------------------------------------------------------------------------------------
 
 
-def test_paper_preset_uses_a_fixed_background_for_scans(tiny_weights: BackboneWeights) -> None:
-    settings = make_settings("paper", steps_coarse=1, steps_sos=1)
-    stylizer = Stylizer.planned(ball(), cameras(2), style(), settings, weights=tiny_weights)
-    assert (stylizer.job.plan.training_background, stylizer.job.plan.warm_start) == ("background", False)
-    assert torch.equal(stylizer.sh_dc, ball().sh_dc[stylizer.job.plan.seen])
-
-
-#: Layers of all terms.
-LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu3_2", "relu3_3", "relu4_1", "relu4_2", "relu5_1")
-
-
 def make_in_float16(weights: BackboneWeights, precision: PlannedPrecision, **values: Any) -> Stylizer:
     """Make a job with a fixed plan, so that the precision does not depend on the processor."""
     inputs = wall(40, 30), cameras(), Style.of(style())
     settings = make_settings(**{"steps_coarse": 2, "steps_sos": 4, "coarsest_side": 24, "early_stop": False, **values})
     plan = plan_job(JobInputs(*inputs, settings, weights=weights)).plan
     return Stylizer(prepare_job(replace(plan, precision=precision), JobInputs(*inputs, settings, weights=weights)))
-
-
-@pytest.mark.parametrize(("style_loss", "weighted"), [("sos", True), ("mixed", False)])
-def test_loss_and_gradient_are_those_of_float64(
-    vgg16_weights: BackboneWeights, style_loss: Any, weighted: bool
-) -> None:
-    """Powers of two cancel in the loss and its gradient, with a content term and position weights too."""
-    image, other = (synthetic_image(48, 64, seed=seed).float() for seed in (1, 2))
-    coverage = torch.rand((48, 64), generator=torch.Generator().manual_seed(0)) if weighted else None
-    results = []
-    for dtype in (torch.float64, torch.float16, torch.bfloat16):
-        network = FeatureNetwork(vgg16_weights, dtype=dtype, layers=LAYERS)
-        loss = SosLoss(network, style_loss=style_loss, coarsest=24, content_weight=100.0)
-        target = loss.targets.of_view(other, coverage)
-        results.append(loss.evaluate(image, loss.targets.of_style(Style.of(style()), (48, 64)), target))
-    exact, half, _ = results
-    assert (half.values - exact.values).abs().max() < 2e-3 * exact.values.abs().max()
-    gradients = [each.image_gradient for each in results if each.image_gradient is not None]
-    errors = [Difference.of(each, gradients[0]).relative_error for each in gradients[1:]]
-    assert errors[0] < 0.6 * errors[1]
 
 
 def test_overflowing_step_is_repeated_in_bfloat16(tiny_weights: BackboneWeights) -> None:

@@ -14,7 +14,6 @@ import psutil
 import pytest
 from PIL import Image
 
-from sgsst_core.errors import SceneError
 from sgsst_core.progress import Progress
 from tests.api.service import PATIENCE, wait_for
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, name_of, shared_memory, small_request
@@ -217,16 +216,6 @@ def test_job_that_is_finished_early_keeps_its_colors(cluster: Cluster, tmp_path:
     assert (report["stopped"], report["workers"]["used"]) == ("on-request", 2)
 
 
-@pytest.mark.slow
-def test_bad_input_is_reported_at_once_and_not_retried(cluster: Cluster, tmp_path: Path) -> None:
-    request, events = small_request(tmp_path, STEPS), EventRecorder()
-    request.source.scene.write_bytes(request.source.scene.read_bytes()[:-1000])
-    with pytest.raises(SceneError, match="truncated"):
-        run(request, cluster, events)
-    assert events.happened == []
-    assert not request.out.parent.exists()
-
-
 # --- the command ---------------------------------------------------------------------------------------------------
 
 
@@ -275,7 +264,7 @@ def test_killed_driver_leaves_no_processes_or_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_and_printed_command_resumes(tmp_path: Path) -> None:
+def test_ctrl_c_saves_and_prints_the_command_that_resumes(tmp_path: Path) -> None:
     request = small_request(tmp_path, STEPS)
     arguments = command(request)
     process = start(arguments)
@@ -284,13 +273,4 @@ def test_ctrl_c_saves_and_printed_command_resumes(tmp_path: Path) -> None:
     assert process.returncode == 130, error
     assert "Traceback" not in error
     assert f"saved in {request.out.with_name('s.checkpoint.safetensors')}" in error
-    resume_command = shlex.split(error.strip().splitlines()[-1])
-    assert resume_command == ["sgsst", *arguments, "--resume"]
-    process = start(resume_command[1:])
-    assert process.stdout is not None
-    shown = process.stdout.read()  # `communicate` would lose what has been read along with the plan
-    _, error = process.communicate(timeout=240)
-    assert process.returncode == 0, error
-    assert "resuming" in shown
-    report = json.loads(request.out.with_name("s.report.json").read_text())
-    assert report["workers"]["requested"] == report["workers"]["used"] == 2
+    assert shlex.split(error.strip().splitlines()[-1]) == ["sgsst", *arguments, "--resume"]
