@@ -20,7 +20,6 @@ from sgsst_core.files.scene_file import read_scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests import networks
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
 from tests.pretend_cuda.runtime import pretend_cuda
@@ -166,28 +165,6 @@ def in_regions(asked: JobSpec) -> JobSpec:
         ["right:half-space=1,0,0,0", "low:half-space=0,1,0,1"], [f"right={asked.styles[0].path}"], ["right=3"], ["low"]
     )
     return asked.model_copy(update={"regions": region_requests(options)})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scan", [False, True])
-def test_step_launches_fewer_than_500_kernels(counts: Counts, scan: bool) -> None:
-    """The larger network, VGG19, takes fewer than 500 launches on three scales, for views of any size.
-
-    A random training background would need another forward pass for the content features.
-    """
-    weighted: dict[str, Any] = {"position_weights": "on" if scan else "off", "training_background": "background"}
-    settings = make_settings(
-        steps_coarse=0, steps_sos=2, coarsest_side=16, scale_sampling=1, precision="float32", **weighted
-    )
-    scene = ball(60) if scan else wall(14, 11, sh_degree=1)
-    weights = networks.comparing_pixels(networks.tiny_weights("vgg19"))
-    stylizer = Stylizer.planned(scene, cameras(1, 64, 64), style(), settings, weights=weights)
-    assert len(stylizer.job.scales(0)) == 3
-    for _ in range(2):
-        counts.clear()
-        stylizer.run_step()
-    assert counts.waits.total() == 1
-    assert 200 < counts.launches.total() < 500, counts.launches
 
 
 @pytest.mark.slow

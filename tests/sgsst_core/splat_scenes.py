@@ -89,13 +89,6 @@ def together(
     )
 
 
-def empty_scene() -> Scene:
-    """Return a scene without Gaussians."""
-    return Scene(
-        torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0, 0, 3)
-    )
-
-
 def colors_of(scene: Scene, seed: int = 5) -> Tensor:
     """Return random colors [N, 3] from 0 to 2, float32."""
     return 2 * torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(seed))

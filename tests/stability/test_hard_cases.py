@@ -62,12 +62,6 @@ def test_precisions_round_as_much_as_they_say() -> None:
         assert 2.0 ** -(way.bits + 6) < error < 2.0 ** -(way.bits - 2), way.name
 
 
-def test_search_counts_outcomes() -> None:
-    ended, failures = search.search(0.0, 3)
-    assert sum(ended.values()) == 1
-    assert not failures
-
-
 def test_search_reports_violated_bounds_and_unexpected_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = {"steps_coarse": 0, "steps_sos": 1, "content_weight": 0}  # content has a bound of its own
     situation = job_cases.Situation(job_cases.crowd(20), texture(30, 26, 1), settings)

@@ -300,29 +300,6 @@ def test_closed_terminal_saves(files: Files, workers: tuple[str, ...]) -> None:
     assert files.out.with_name("stylized.checkpoint.safetensors").exists()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("command", ["plan", "stylize"])
-def test_ctrl_c_during_survey_leaves_no_files(files: Files, command: str) -> None:
-    """The progress bar shows when the survey runs; there are enough views for the signal to arrive meanwhile."""
-    views, out = 2000, files.out if command == "stylize" else files.out.with_name("plan.json")
-    inputs = [str(files.ply), "--style", str(files.style), "--orbit", str(views), "--backbone", "vgg16"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "120"}
-    ours, theirs = pty.openpty()
-    arguments = [sys.executable, "-m", "api.cli", command, *inputs, "--out", str(out)]
-    with subprocess.Popen(
-        arguments, stdout=theirs, stderr=theirs, env=environment, cwd=files.ply.parent, start_new_session=True
-    ) as process:
-        os.close(theirs)
-        shown = _shown_until(ours, rf"Surveying the views.* [1-9]\d*/{views}")
-        process.send_signal(signal.SIGINT)
-        shown += _shown_until(ours, None)
-        assert process.wait(timeout=60) == 130, shown
-    os.close(ours)
-    assert max(int(count) for count in re.findall(rf"(\d+)/{views}", shown)) < views
-    assert "Traceback" not in shown
-    assert not files.out.parent.exists() or not list(files.out.parent.iterdir())
-
-
 def _shown_until(terminal: int, pattern: str | None) -> str:
     """Return a program's terminal output until a pattern matches it; if `pattern` is None, until the program ends."""
     shown = ""

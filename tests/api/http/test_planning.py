@@ -33,23 +33,6 @@ def events(client: httpx2.Client, files: dict[str, bytes], **parameters: Any) ->
         return [sent for sent in source if sent.data]
 
 
-@pytest.mark.slow
-def test_events_report_views_and_same_plan(client: httpx2.Client, files: dict[str, bytes]) -> None:
-    before = jobs(client)
-    *planning, last = events(client, files)
-    assert {sent.event for sent in planning} == {"planning"}
-    now = [json.loads(sent.data) for sent in planning]
-    assert {entry["stage"] for entry in now} == {"planning"}
-    assert [entry["total"] for entry in now] == [3] * len(now)
-    assert [entry["step"] for entry in now] == sorted(entry["step"] for entry in now)
-    assert (now[-1]["step"], now[-1]["fraction"]) == (3, 1.0)
-    assert last.event == "plan"
-    plain = client.post("/v1/jobs", **request(files))
-    assert plain.headers["content-type"] == "application/json"
-    assert plain.json() == json.loads(last.data)
-    assert jobs(client) == before
-
-
 def test_estimate_covers_the_whole_job(client: httpx2.Client, files: dict[str, bytes]) -> None:
     plan = client.post("/v1/jobs", **request(files)).json()
     assert plan["warnings"] == []

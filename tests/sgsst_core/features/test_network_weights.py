@@ -27,7 +27,6 @@ from sgsst_core.features.network_weights import (
     load_network_weights,
     load_perceptual,
 )
-from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.features.weight_files import (
     PACKAGE_DIGEST,
     PACKAGE_FILES,
@@ -140,18 +139,6 @@ def test_torchvision_vgg16_can_be_installed_from_a_file(tmp_path: Path) -> None:
     assert weights.name == "vgg16"
     for layer, (weight, _) in weights.convolutions.items():
         assert torch.equal(weight, layers[layer][0])
-
-
-def test_other_channel_counts_are_preserved(tiny_weights: BackboneWeights, tiny_cache: Path) -> None:
-    weights = load_network_weights("vgg16", tiny_cache)
-    for layer, (weight, bias) in tiny_weights.convolutions.items():
-        assert torch.equal(weights.convolutions[layer][0], weight)
-        assert torch.equal(weights.convolutions[layer][1], bias)
-    network = FeatureNetwork(weights, ("relu1_1", "relu5_1"))
-    assert [network.channels(layer) for layer in network.layers] == [16, 16]
-    for pixels in (16, 8):  # the smaller one is too small for relu5_1
-        features = network.forward(torch.zeros(pixels, pixels, 3)).features
-        assert features["relu5_1"].shape == (pixels // 16, pixels // 16, 16)
 
 
 def test_auto_prefers_vgg19(vgg19_folder: Path, folder: Path) -> None:

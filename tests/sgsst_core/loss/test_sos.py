@@ -23,7 +23,7 @@ from sgsst_core.loss.feature_scale import (
     paper_scales,
     with_scales,
 )
-from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import (
     MAX_VECTORS,
     ContentDifference,
@@ -52,10 +52,11 @@ FLOAT64_TOLERANCE = 1e-9
 FLOAT32_TOLERANCE = 1e-5
 
 
-def setting(size, *, covered=False):
+def setting(size, *, covered=False, style=None):
     """Return float64 image, style, content and coverage (None unless `covered`) for a view of this size."""
     image, content = synthetic_image(*size, seed=1), synthetic_image(*size, seed=2)
-    style = resize_area(synthetic_image(600, 500, seed=3) ** 2, style_size((600, 500), size))
+    if style is None:
+        style = resize_area(synthetic_image(600, 500, seed=3) ** 2, style_size((600, 500), size))
     coverage = None
     if covered:
         coverage = (synthetic_image(*size, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
@@ -64,8 +65,11 @@ def setting(size, *, covered=False):
 
 
 def evaluate(network, case, tile_size, **options):
-    image, style, content, coverage = (None if t is None else t.to(network.dtype) for t in case)
-    loss = SosLoss(network, tile_size=tile_size, **options)
+    return evaluate_loss(SosLoss(network, tile_size=tile_size, **options), case)
+
+
+def evaluate_loss(loss, case):
+    image, style, content, coverage = (None if part is None else part.to(loss.network.dtype) for part in case)
     targets = loss.targets.of_style(Style.of(style), image.shape[:2])
     return loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
 
@@ -288,6 +292,7 @@ def test_loss_and_gradient_are_zero_without_positions():
 
 EPS = torch.finfo(torch.float64).eps
 MATCHED: tuple[StyleLossName, ...] = ("nnfm", "mixed")
+MATCHED_STYLE = synthetic_image(90, 110, seed=3) ** 2
 
 
 def loss_of(
@@ -295,36 +300,6 @@ def loss_of(
 ) -> SosLoss:
     network = FeatureNetwork(weights, layers_of(style_loss, weights, content=True), dtype)
     return SosLoss(network, style_loss=style_loss, **options)  # type: ignore[arg-type]
-
-
-def matched_setting(
-    height: int, width: int, *, covered: bool = False, style: tuple[int, int] = (90, 110)
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Return image, style, content and coverage (None unless `covered`) for a view of this size."""
-    coverage = None
-    if covered:
-        coverage = (synthetic_image(height, width, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
-        coverage[: height // 3] = 0
-    return (
-        synthetic_image(height, width, seed=1),
-        synthetic_image(*style, seed=3) ** 2,
-        synthetic_image(height, width, seed=2),
-        coverage,
-    )
-
-
-def evaluate_loss(loss: SosLoss, case: tuple[Tensor, Tensor, Tensor, Tensor | None]) -> SosResult:
-    image, style, content, coverage = (None if part is None else part.to(loss.network.dtype) for part in case)
-    assert image is not None
-    assert style is not None
-    assert content is not None
-    targets = loss.targets.of_style(Style.of(style), (image.shape[0], image.shape[1]))
-    return loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
-
-
-def gradient_of(result: SosResult) -> Tensor:
-    assert result.image_gradient is not None
-    return result.image_gradient
 
 
 def features(positions: tuple[int, int], channels: tuple[int, ...], seed: int) -> dict[str, Tensor]:
@@ -353,26 +328,26 @@ def test_any_partition_agrees_with_untiled_autograd(
     network: str, style_loss: StyleLossName, tile_size: int | None, covered: bool
 ) -> None:
     weights = make_tiny_weights(network)  # type: ignore[arg-type]
-    image, style, content, coverage = case = matched_setting(101, 150, covered=covered)
+    image, style, content, coverage = case = setting((101, 150), covered=covered, style=MATCHED_STYLE)
     expected, gradient = sos_reference(
         weights, image, style, content, coverage=coverage, style_loss=style_loss, coarsest=60
     )
     result = evaluate_loss(loss_of(weights, style_loss, tile_size=tile_size, coarsest=60), case)
     assert (result.scales, result.loss) == ((0, 1), pytest.approx(expected, rel=1e-9))
-    assert relative_error(gradient_of(result), gradient) < 1e-9
+    assert relative_error(result.image_gradient, gradient) < 1e-9
     assert all(terms["nearest"] > 0 for terms in result.terms.values())
     assert all((terms["gram"] > 0) == (style_loss == "mixed") for terms in result.terms.values())
 
 
 def test_lower_precisions_agree_with_float64(vgg16_weights: BackboneWeights) -> None:
-    case = matched_setting(84, 100)
+    case = setting((84, 100), style=MATCHED_STYLE)
     exact, *lower = (
         evaluate_loss(loss_of(vgg16_weights, "nnfm", dtype), case)
         for dtype in (torch.float64, torch.float32, torch.bfloat16)
     )
     for actual, loss, gradient in zip(lower, (1e-5, 1e-2), (1e-2, 0.5), strict=True):
         assert actual.loss == pytest.approx(exact.loss, rel=loss)
-        assert relative_error(gradient_of(actual), gradient_of(exact)) < gradient
+        assert relative_error(actual.image_gradient, exact.image_gradient) < gradient
 
 
 def test_first_of_equally_near_vectors_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -415,11 +390,11 @@ def test_nan_features_give_nan_gradients() -> None:
 
 @pytest.mark.parametrize("style_loss", MATCHED)
 def test_uncovered_positions_are_ignored(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
-    image, style, content, _ = matched_setting(96, 64)
+    image, style, content, _ = setting((96, 64), style=MATCHED_STYLE)
     coverage = torch.zeros((96, 64), dtype=torch.float64)
     loss = loss_of(tiny_weights, style_loss)
     nothing = evaluate_loss(loss, (image, style, content, coverage))
-    assert (nothing.loss, gradient_of(nothing).abs().max()) == (0, 0)
+    assert (nothing.loss, nothing.image_gradient.abs().max()) == (0, 0)
     coverage[:32] = 1
     other = image.clone()
     other[80:] = 0  # outside the receptive field of covered cells

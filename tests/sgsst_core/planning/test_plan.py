@@ -25,11 +25,9 @@ from sgsst_core.planning.facts import Device, Facts, Machine, describe_machine, 
 from sgsst_core.planning.plan import Plan, choose_precision, make_plan, with_groups
 from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import Pace, TimeChoice, choosable, choose
-from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import repeating_options
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import PlannedPrecision, Precision, PresetName, Settings, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import save_plan
@@ -127,17 +125,6 @@ def test_bound_on_memory_holds(tiny_weights: BackboneWeights) -> None:
     before = psutil.Process().memory_info().rss
     run(stylizer)
     assert max(record.memory for record in stylizer.history) - before < stylizer.job.plan.peak_bytes
-
-
-def test_rendering_without_unseen_gaussians_is_bit_identical(tiny_weights: BackboneWeights) -> None:
-    scene, views = behind(wall(sh_degree=2), 100), cameras(3)
-    lean, whole = make(scene, views, tiny_weights), make_rasterizer("cpu", scene)
-    assert len(lean.sh_dc) < len(scene)
-    warm = replace(scene, sh_dc=scene.sh_dc.clone())
-    warm.sh_dc[lean.job.plan.seen] = lean.sh_dc.detach()
-    for index in range(3):
-        image = lean.job.views.render(index, lean.job.views.colors(index, lean.sh_dc.detach()))
-        assert torch.equal(image, whole.render(scene_colors(warm, views[index]), views[index]))
 
 
 def test_decisions_name_skipped_work(tiny_weights: BackboneWeights) -> None:

@@ -34,7 +34,6 @@ from tests.sgsst_core.splat_scenes import (
     camera,
     cloud,
     colors_of,
-    empty_scene,
     needles,
     pixels_like,
     rotated_pose,
@@ -195,7 +194,7 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize(
     "scene",
-    [empty_scene(), single((0, 0, -3.0)), single((1e6, 0, 1.0)), single((0, 0, 3.0), opacity=0.003)],
+    [cloud(0), single((0, 0, -3.0)), single((1e6, 0, 1.0)), single((0, 0, 3.0), opacity=0.003)],
     ids=["empty", "behind", "beside", "faint"],
 )
 def test_view_without_gaussians_is_background(name: str, scene: Scene) -> None:

@@ -204,11 +204,6 @@ def test_position_weights_are_for_views_with_an_empty_background(
 COLOR: Color = (0.2, 0.9, 0.4)
 
 
-def make_over_background(weights: BackboneWeights, scene: Scene, views: int = 3, **values: Any) -> Stylizer:
-    settings = make_settings(**{"steps_coarse": 3, "steps_sos": 5, "coarsest_side": 24, **values})
-    return Stylizer.planned(scene, cameras(views), style(), settings, weights=weights)
-
-
 # --- colors -------------------------------------------------------------------------------------------------------
 
 
@@ -261,8 +256,8 @@ def test_step_gradient_matches_a_job_with_its_background(
     tiny_weights: BackboneWeights, scales: list[int], content: Literal["cached", "uncached"]
 ) -> None:
     """The content also gets the step's background, whether or not its images are cached."""
-    drawn = make_over_background(tiny_weights, ball(), training_background="random", background=(0.1, 0.1, 0.5))
-    fixed = make_over_background(tiny_weights, ball(), training_background="background", background=COLOR)
+    drawn = make(tiny_weights, ball(), coarsest_side=24, training_background="random", background=(0.1, 0.1, 0.5))
+    fixed = make(tiny_weights, ball(), coarsest_side=24, training_background="background", background=COLOR)
     if content == "uncached":
         drawn.job.view_targets._images = Cache(0, lambda _: 1)
     with torch.no_grad():
@@ -291,10 +286,9 @@ def test_photos_get_the_color_in_uncovered_pixels(tiny_weights: BackboneWeights)
 
 def test_losses_are_measured_on_the_fixed_background(tiny_weights: BackboneWeights) -> None:
     """Losses before and after are measured on the background of the settings, whatever the steps used."""
-    values: dict[str, Any] = {"background": (0.3, 0.2, 0.1), "warm_start": False}
+    values: dict[str, Any] = {"coarsest_side": 24, "background": (0.3, 0.2, 0.1), "warm_start": False}
     drawn, fixed = (
-        make_over_background(tiny_weights, ball(), training_background=kind, **values)
-        for kind in ("palette", "background")
+        make(tiny_weights, ball(), training_background=kind, **values) for kind in ("palette", "background")
     )
     assert drawn.start() == fixed.start()
     run(drawn)

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import resource
 import signal
 import threading
 import time
@@ -15,24 +14,13 @@ from typing import Any, Literal
 import psutil
 
 from sgsst_core.settings import make_settings
+from tests.full_disk import full_disk
 from tests.small_scenes import wall, write_files
 from worker.job import JobSpec, SceneRequest
 from worker.options import StyleFile
 from worker.ranks.rank import OpenWorkplace, RankProcess, RankTask
 
-Place = Literal[
-    "render",
-    "loss",
-    "optimizer",
-    "gather_parts",
-    "reduce_parts",
-    "all_reduce",
-    "all_reduce_statistics",
-    "all_gather",
-    "checkpoint",
-    "split_group",
-    "finish",
-]
+Place = Literal["all_reduce", "checkpoint", "render"]
 
 
 @dataclass(frozen=True)
@@ -59,12 +47,9 @@ class Fault:
         _file(request).write_text(json.dumps(asdict(self)))
 
     def arm(self, request: JobSpec) -> None:
-        """Install the fault in this process once the job is planned, unless it belongs to planning."""
+        """Install the fault in this process once the job is planned."""
         from sgsst_core.stylizing.stylizer import Stylizer
 
-        if self.place == "split_group":
-            self._install(request)
-            return
         create: Callable[..., None] = Stylizer.__init__
 
         def create_and_install(stylizer: Stylizer, *arguments: Any, **options: Any) -> None:
@@ -87,7 +72,7 @@ class Fault:
             _file(request).rename(_fired(request))  # the fault must not occur in the next attempt
             os.utime(_fired(request))  # record the current time, which a renamed file does not have
             if self.what == "full":
-                with _full_disk():
+                with full_disk(4096):
                     return original(*arguments, **options)
             threading.Thread(target=self._signal, daemon=True).start()
             time.sleep(0)
@@ -162,31 +147,13 @@ def _fired(request: JobSpec) -> Path:
     return request.out.with_suffix(".fired")
 
 
-def _places() -> dict[str, tuple[Any, str]]:
-    from sgsst_core.loss.sos import SosLoss
+def _places() -> dict[Place, tuple[Any, str]]:
     from sgsst_core.stylizing import checkpoint
-    from sgsst_core.stylizing.stylizer import ColorOptimizer
     from sgsst_core.stylizing.views import Views
-    from worker import execute as execute
     from worker.ranks.process_group import ProcessGroupCollectives
 
-    exchanges = ("split_group", "gather_parts", "reduce_parts", "all_reduce", "all_reduce_statistics", "all_gather")
     return {
-        "render": (Views, "render"),
-        "loss": (SosLoss, "evaluate"),
-        "optimizer": (ColorOptimizer, "update"),
+        "all_reduce": (ProcessGroupCollectives, "all_reduce"),
         "checkpoint": (checkpoint, "_write"),
-        "finish": (execute, "_finish"),
-        **{name: (ProcessGroupCollectives, name) for name in exchanges},
+        "render": (Views, "render"),
     }
-
-
-class _full_disk:  # noqa: N801 (reads as the state that it makes)
-    """Simulation of a full disk: within the block, this process can only write files of a few kilobytes."""
-
-    def __enter__(self) -> None:
-        self._before = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, self._before[1]))
-
-    def __exit__(self, *error: object) -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, self._before)

@@ -395,15 +395,6 @@ def test_exchange_of_shown_gaussians_is_bit_identical_to_all(scene: Scene, heigh
         assert [sent["gradient"] for sent in result["bytes shown"]] == [len(scene) + 12 * shown, 12 * shown]
 
 
-def test_whole_gradient_is_sent_if_nearly_all_is_shown() -> None:
-    camera = cameras(1, WIDTH, HEIGHT)[0]
-    scene = wall().subset(shown_of(wall(), camera))
-    for result in on_ranks(2, both_ways, scene, camera):
-        for whole, packed in zip(result["whole"], result["shown"], strict=True):
-            assert torch.equal(whole, packed)
-        assert [sent["gradient"] for sent in result["bytes shown"]] == [13 * len(scene), 12 * len(scene)]
-
-
 def test_one_rank_sends_nothing() -> None:
     stylizer = Stylizer.planned(wall(), cameras(1), style(), make_settings(steps_coarse=0), weights=tiny_weights())
     assert stylizer.run_step().sent == {}
