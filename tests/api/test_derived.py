@@ -189,9 +189,3 @@ def test_options_beyond_the_limits_are_refused(
     answer = client.post(f"/v1/jobs/{job}/video", json=options)
     assert answer.status_code == status
     assert message in answer.text
-
-
-def test_jobs_without_a_result_have_no_video(client: httpx2.Client, job: str) -> None:
-    assert client.post(f"/v1/jobs/{'job_' + 31 * '0'}/video", json={}).status_code == 404
-    broken = client.post(f"/v1/jobs/{job}/video", content=b"{", headers={"Content-Type": "application/json"})
-    assert broken.status_code in (400, 422)

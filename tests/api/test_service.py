@@ -214,28 +214,6 @@ def read(folder: Path, data: bytes) -> SceneFile:
 
 
 @pytest.mark.slow
-def test_retried_job_resumes_from_checkpoint(
-    service: Service, client: httpx2.Client, files: dict[str, Path], expected: bytes
-) -> None:
-    job_id = submit(client, files)
-    wait_for_step(service, client, job_id, 10)
-    assert client.post(f"/v1/jobs/{job_id}/cancel").json()["status"] == "canceling"
-    assert client.delete(f"/v1/jobs/{job_id}").status_code == 409
-    canceled = wait_until(service, client, job_id, "canceled")
-    assert canceled["attempts"][0]["outcome"] == "canceled"
-    assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").status_code == 404
-    assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
-    assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 202
-    seen = events(client, job_id)
-    wait_until(service, client, job_id, "succeeded")
-    second = [data["step"] for _, kind, data in seen if kind == "progress" and data["attempt"] == 2]
-    assert min(step for step in second if step) >= 10, "it started over"
-    assert result(client, job_id) == expected
-    assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 409
-    assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
-
-
-@pytest.mark.slow
 def test_stopped_job_is_continued(
     service: Service, client: httpx2.Client, files: dict[str, Path], expected: bytes
 ) -> None:
@@ -330,21 +308,6 @@ def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path
             client.post(f"/v1/jobs/{job_id}/cancel")
         for job_id in jobs:
             wait_until(service, client, job_id, "canceled")
-
-
-@pytest.mark.slow
-def test_job_reuses_the_plan_of_its_dry_run(service: Service, client: httpx2.Client, files: dict[str, Path]) -> None:
-    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-    data = {"parameters": json.dumps(PARAMETERS | {"steps_sos": 5})}
-    answer = client.post("/v1/jobs", params={"dry_run": True}, files=body, data=data)
-    assert answer.status_code == 200, answer.text
-    plan = answer.json()
-    assert (plan["gaussians"], plan["views"], plan["sh_degree"]) == (616, 3, 1)
-    assert (plan["memory_bytes"] > 0, plan["device_memory_bytes"]) == (True, None)
-    job_id = submit(client, files, steps_sos=5)
-    wait_until(service, client, job_id, "succeeded")
-    reused = client.get(f"/v1/jobs/{job_id}/artifacts/plan.json").json()
-    assert reused["decisions"] == plan["plan"]["decisions"]
 
 
 def test_logs_contain_no_errors(service: Service) -> None:

@@ -87,9 +87,6 @@ def test_several_styles_are_mixed_by_weight(files: Files, sgsst: Sgsst) -> None:
         ("other:2.png", 0.75),
     ]
     assert "(75%)" in files.out.with_name("stylized.report.html").read_text()
-    plan = ["plan", str(files.ply), "--cameras", str(files.cameras), "--backbone", "vgg16", *options[:4]]
-    assert main([*plan, "--out", str(files.out.with_suffix(".json"))]) == 0
-    assert shares in files.out.with_suffix(".json").read_text()
     assert "the weight must be a finite number above 0, not 0" in sgsst([*files.stylize(), "--style", f"{other}:0"], 2)
 
 

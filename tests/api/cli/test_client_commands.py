@@ -66,9 +66,7 @@ def test_exit_codes_and_errors_as_json(
     assert sgsst(["status", MISSING], 3) == f"error: There is no job {MISSING}.\n"
 
 
-def test_job_that_ended_early_says_how_little_was_done(
-    files: list[str], sgsst: Sgsst, service: Service, tmp_path: Path
-) -> None:
+def test_job_that_ended_early_says_how_little_was_done(files: list[str], sgsst: Sgsst, service: Service) -> None:
     job_id = submit(files, sgsst)
     service.finish(job_id, {"stylized.ply": b"result"}, stopped="within", steps=2, total=60, loss_after=1.94)
     shown = sgsst(["status", job_id])
@@ -208,7 +206,7 @@ def test_webhook_events_are_checked_before_files_are_sent(files: list[str], sgss
         assert message in sgsst(["submit", *files, "--webhook-events", event, "--url", "http://127.0.0.1:1"], 2)
 
 
-def test_share_prints_the_link(files: list[str], sgsst: Sgsst, service: Service, tmp_path: Path) -> None:
+def test_share_prints_the_link(files: list[str], sgsst: Sgsst, service: Service) -> None:
     job_id = submit(files, sgsst)
     assert "only results can be shared" in sgsst(["share", job_id], 4)
     service.finish(job_id, {"stylized.ply": b"result"})

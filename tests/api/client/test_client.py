@@ -24,7 +24,6 @@ import torch
 from api.client import AsyncClient, Client, uploads
 from api.client.transport import TRIES, ApiError, Event, Job, RequestError
 from api.client.uploads import camera_files, image_files
-from service.store import Store
 from sgsst_core.files.atomic import temporary_path
 from tests.api.service import Service
 from tests.http_servers import LocalServer, send
@@ -141,7 +140,6 @@ def test_unpacked_streamed_sog_is_sent_as_an_archive(
 def test_job_from_upload_to_removal(
     connect: Any,
     service: Service,
-    store: Store,
     paths: dict[str, Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -341,7 +339,7 @@ class Relay:
 
 @both
 def test_download_resumes_after_lost_connection(
-    connect: Any, service: Service, store: Store, paths: dict[str, Path], tmp_path: Path
+    connect: Any, service: Service, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
         job_id = client.submit(paths["scene"], paths["style"], orbit=2).id
@@ -364,7 +362,7 @@ def test_download_resumes_after_lost_connection(
 
 @both
 def test_download_through_compressing_proxies(
-    connect: Any, service: Service, store: Store, paths: dict[str, Path], tmp_path: Path
+    connect: Any, service: Service, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     """nginx makes ETags weak when it compresses; another proxy compresses although it is asked not to."""
     with connect(service.url) as client:
@@ -389,7 +387,7 @@ def test_download_through_compressing_proxies(
 
 @both
 def test_partial_file_is_resumed_or_discarded_and_no_other_touched(
-    connect: Any, service: Service, store: Store, paths: dict[str, Path], tmp_path: Path
+    connect: Any, service: Service, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
         job_id = client.submit(paths["scene"], paths["style"], orbit=2).id
@@ -414,9 +412,7 @@ def test_partial_file_is_resumed_or_discarded_and_no_other_touched(
 
 
 @both
-def test_events_resume_after_lost_connection(
-    connect: Any, service: Service, store: Store, paths: dict[str, Path], tmp_path: Path
-) -> None:
+def test_events_resume_after_lost_connection(connect: Any, service: Service, paths: dict[str, Path]) -> None:
     with connect(service.url) as client:
         job_id = client.submit(paths["scene"], paths["style"], orbit=2).id
         for _ in range(5):

@@ -119,12 +119,6 @@ def test_results_are_kept_at_most_as_long_as_the_service_does(client: httpx2.Cli
         assert detail in problem["detail"]
 
 
-def test_invalid_query_is_named_as_it_was_sent(client: httpx2.Client) -> None:
-    problem = refused(client.get("/v1/jobs", params={"limit": "many"}), 422, "invalid-request")
-    assert problem["detail"].startswith("limit: ")
-    assert problem["errors"][0]["at"] == "limit"
-
-
 def test_missing_and_surplus_files_are_rejected(client: httpx2.Client, files: dict[str, bytes]) -> None:
     assert refused(client.post("/v1/jobs", files=form(files, style=None)), 422, "invalid-request")["input"] == "style"
     photo = ("photos", ("a.png", files["style"]))
@@ -573,7 +567,8 @@ def test_unknown_paths_and_methods(client: httpx2.Client) -> None:
     assert client.head("/v1/jobs/job_1/cancel").status_code == 405
     for job_id in ("job_00000000000", "../x", "job_' OR 1=1", "a" * 5000):
         assert client.get(f"/v1/jobs/{job_id}").status_code == 404
-    refused(client.get("/v1/jobs", params={"limit": 0}), 422, "invalid-request")
+    problem = refused(client.get("/v1/jobs", params={"limit": "many"}), 422, "invalid-request")
+    assert problem["errors"][0]["at"] == "limit"
     refused(client.get("/v1/jobs", params={"cursor": "x"}), 422, "invalid-request")
     refused(client.get("/v1/jobs", params={"status": "x"}), 422, "invalid-request")
 

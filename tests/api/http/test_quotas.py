@@ -4,9 +4,7 @@ import json
 import os
 import stat
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import httpx2
 import pytest
@@ -17,7 +15,6 @@ from service.store.keys import NO_QUOTAS, Quotas
 from tests.api.conftest import Sgsst
 from tests.api.http.sending import TUS, begin, closed, connect, form, lines, refused, send
 from tests.api.service import PATIENCE, Service, wait_for
-from tests.postgres import fresh_database, is_installed, server
 from tests.service.store.helpers import Clock, usage_of
 
 
@@ -185,7 +182,8 @@ def test_declared_bytes_over_quota_are_rejected_early(service: Service) -> None:
         connection.sendall(lines(head + "Content-Type: multipart/form-data; boundary=x"))
         assert connection.recv(4096).startswith(b"HTTP/1.1 429 "), "no byte of the body was sent"
     assert on_disk(service) == before
-    assert stored_bytes(service, owner) == 0
+    with service.store() as store:
+        assert usage_of(store, owner).stored_bytes == 0
 
 
 def test_undeclared_bytes_are_charged_on_arrival(service: Service) -> None:
@@ -213,59 +211,3 @@ def test_deleted_uploads_release_quota(service: Service) -> None:
             assert send(client, where, 0, content).status_code == 204
             assert client.delete(where, headers=TUS).status_code == 204
             assert on_disk(service) == before
-
-
-def stored_bytes(service: Service, owner: str) -> int:
-    with service.store() as store:
-        return usage_of(store, owner).stored_bytes
-
-
-# --- many requests at once -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(not is_installed(), reason="PostgreSQL's server is not installed")
-@pytest.mark.slow
-def test_concurrent_requests_stay_within_limits(tmp_path: Path, files: dict[str, bytes]) -> None:
-    """The test uses PostgreSQL, where concurrent transactions do not see each other's rows."""
-    limits = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_JOBS_PER_KEY": "7"}
-    with (
-        server(durable=True) as url,
-        Service(tmp_path / "data", alone=True, SGSST_DATABASE=fresh_database(url), **limits) as service,
-        service.client(key(service, NO_QUOTAS)) as client,
-    ):
-        assert client.post("/v1/jobs", files=form(files)).status_code == 202  # so that later jobs add no bytes
-        size = sum(len(content) for content in files.values())
-
-        _, many = owner_and_key(service, NO_QUOTAS)
-        submit_first(service, many, files)
-        assert at_once(service, many, "/v1/jobs", files=form(files)) == {202: 6, 429: 94}
-
-        _, daily = owner_and_key(service, Quotas(jobs_a_day=5))
-        submit_first(service, daily, files)
-        assert at_once(service, daily, "/v1/jobs", files=form(files)) == {202: 4, 429: 96}
-
-        owner, uploads = owner_and_key(service, Quotas(stored_bytes=10 * MB))
-        length = TUS | {"Upload-Length": str(3 * MB)}
-        assert at_once(service, uploads, "/v1/uploads", headers=length) == {201: 3, 429: 97}
-        assert stored_bytes(service, owner) == 9 * MB
-
-        owner, requests = owner_and_key(service, Quotas(stored_bytes=3 * size))
-        submit_first(service, requests, files)
-        answers = at_once(service, requests, "/v1/jobs", files=form(files))
-        assert answers.keys() == {202, 429}
-        assert 1 <= answers[202] <= 6
-        assert stored_bytes(service, owner) == size
-        assert on_disk(service) == size, "all jobs have the same files"
-
-
-def submit_first(service: Service, text: str, files: dict[str, bytes]) -> None:
-    """Submit a job, so that further jobs of the key with these files need no check; checks have few places to wait."""
-    with service.client(text) as client:
-        assert client.post("/v1/jobs", files=form(files)).status_code == 202
-
-
-def at_once(service: Service, text: str, path: str, **request: Any) -> dict[int, int]:
-    """Send a request a hundred times concurrently; return the number of responses by status."""
-    with service.client(text) as client, ThreadPoolExecutor(100) as pool:
-        answers = list(pool.map(lambda _: client.post(path, timeout=PATIENCE, **request).status_code, range(100)))
-    return {status: answers.count(status) for status in set(answers)}

@@ -152,19 +152,6 @@ def test_request_key_overrides_session(browser: httpx2.Client, store: Store, key
     assert canceled.status_code == 200
 
 
-def test_sessions_cannot_access_each_others_jobs(service: Service, store: Store) -> None:
-    rows = [store.keys.create(name) for name in ("dora", "emil")]
-    jobs = [job_of(store, row.id) for row, _ in rows]
-    for (_, key), own, other in zip(rows, jobs, jobs[::-1], strict=True):
-        with service.client() as browser:
-            browser.headers["Origin"] = service.url
-            sign_in(browser, key)
-            assert browser.get(f"/v1/jobs/{own}").status_code == 200
-            for path in ("", "/events", "/progress", "/inputs", "/inputs/scene", "/artifacts", "/artifacts/plan.json"):
-                refused(browser.get(f"/v1/jobs/{other}{path}"), 404, "not-found")
-            refused(browser.delete(f"/v1/jobs/{other}"), 404, "not-found")
-
-
 # --- other sites ---------------------------------------------------------------------------------------------------
 
 #: Headers of browsers for requests from another site's page, or from an unknown page.

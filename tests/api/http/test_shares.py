@@ -30,7 +30,7 @@ def service(services: Services) -> Service:
 
 
 @pytest.fixture
-def me(service: Service, store: Store) -> Iterator[httpx2.Client]:
+def me(service: Service) -> Iterator[httpx2.Client]:
     with service.client(service.key()) as client:
         yield client
 
@@ -63,7 +63,7 @@ def assert_missing(answer: httpx2.Response, code: str = "not-found") -> None:
 
 
 def test_link_shows_the_result_and_nothing_else(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     job_id = finished(me, service, paths)
     view, token = share(me, job_id)
@@ -101,7 +101,7 @@ def test_link_shows_the_result_and_nothing_else(
 
 
 def test_link_with_poster_names_its_image(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     job_id = finished(me, service, paths)
     assert me.patch(f"/v1/jobs/{job_id}", json={"name": 'my "<wall>"'}).status_code == 200
@@ -166,7 +166,7 @@ def test_link_shows_the_named_viewpoints(
 
 
 def test_only_permitted_sites_may_frame_a_link(
-    service: Service, services: Services, store: Store, me: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, services: Services, me: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     job_id = finished(me, service, paths)
     hidden, posted = (me.post(f"/v1/jobs/{job_id}/shares", json={"poster": poster}).json() for poster in (False, True))
@@ -201,11 +201,9 @@ def test_only_permitted_sites_may_frame_a_link(
 )
 def test_token_opens_no_other_file(
     service: Service,
-    store: Store,
     me: httpx2.Client,
     visitor: httpx2.Client,
     paths: dict[str, Path],
-    tmp_path: Path,
     name: str,
 ) -> None:
     _, token = share(me, finished(me, service, paths))
@@ -213,7 +211,7 @@ def test_token_opens_no_other_file(
 
 
 def test_token_is_no_key_and_of_one_job(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     job_id, other = (finished(me, service, paths) for _ in range(2))
     view, token = share(me, job_id)
@@ -238,7 +236,7 @@ def test_token_is_no_key_and_of_one_job(
 
 
 def test_wrong_tokens_open_nothing(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     view, token = share(me, finished(me, service, paths))
     secret = token.partition(".")[2]
@@ -251,7 +249,7 @@ def test_wrong_tokens_open_nothing(
 
 
 def test_link_ends_when_it_expires_or_is_revoked(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     job_id = finished(me, service, paths)
     (first, one), (second, two), (_, three) = (share(me, job_id) for _ in range(3))
@@ -270,7 +268,7 @@ def test_link_ends_when_it_expires_or_is_revoked(
 
 
 def test_link_ends_with_the_key_of_its_job(
-    service: Service, store: Store, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, visitor: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     key, text = store.keys.create("leaving")
     with service.client(text) as client:
@@ -280,9 +278,7 @@ def test_link_ends_with_the_key_of_its_job(
     assert_missing(visitor.get(f"/v1/shared/{token}"))
 
 
-def test_only_results_of_ones_own_can_be_shared(
-    service: Service, store: Store, me: httpx2.Client, paths: dict[str, Path], tmp_path: Path
-) -> None:
+def test_only_results_of_ones_own_can_be_shared(service: Service, me: httpx2.Client, paths: dict[str, Path]) -> None:
     job_id = finished(me, service, paths)
     with service.client(service.key()) as other:
         for method in ("GET", "POST"):
@@ -308,7 +304,7 @@ def test_only_results_of_ones_own_can_be_shared(
 
 
 def test_expired_links_do_not_count_toward_the_limit(
-    store: Store, service: Service, me: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    store: Store, service: Service, me: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     job_id = finished(me, service, paths)
     for _ in range(MOST_SHARES):
@@ -321,7 +317,7 @@ def test_expired_links_do_not_count_toward_the_limit(
 
 
 def test_stored_digest_is_no_token_and_logs_contain_none(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     job_id = finished(me, service, paths)
     view, token = share(me, job_id)
@@ -351,7 +347,7 @@ def test_requests_of_a_link_are_limited(paths: dict[str, Path], tmp_path: Path) 
 
 
 def test_link_whose_files_hang_occupies_no_thread_of_others(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     job_id = finished(me, service, paths)
     _, token = share(me, job_id)

@@ -210,7 +210,7 @@ def test_api_process_leaves_reading_to_the_confined_one(tmp_path: Path, files: F
 
 @pytest.mark.parametrize("what", [format.name for format in FORMATS if format is not PLY])
 def test_compressed_scenes_are_detected_from_their_content(
-    client: httpx2.Client, store: Store, files: Files, packed: Files, what: str
+    client: httpx2.Client, files: Files, packed: Files, what: str
 ) -> None:
     """The format is detected regardless of the file name, for files in the request and for tus uploads."""
     answer = client.post("/v1/jobs", files=form(files, scene=("my scan.ply", packed[what])))
