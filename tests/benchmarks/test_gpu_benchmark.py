@@ -16,7 +16,6 @@ from benchmarks.gpu.__main__ import PARTS
 pytest.importorskip("triton")
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
-PASSES = {"forward_seconds", "backward_seconds"}
 
 
 def benchmark(folder: Path, *options: str) -> tuple[int, dict[str, Any]]:
@@ -37,27 +36,17 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     )
     assert status == 0
     assert written["quick"]
-    assert {"date", "machine", "device", "torch"} <= set(written)
     findings = {name: part["findings"] for name, part in parts.items()}
     assert all(check["passed"] for check in findings["poison"]["small"].values())
-    assert len(findings["poison"]["small"]) == 5
     assert all(findings["parity"]["triton"][name]["passed"] for name in ("image", "coverage", "gradient"))
     assert findings["parity"]["triton"]["different_of_2_repeats"]["error"] == 0
     whole = findings["job"]["3x32x32"]
     assert whole["steps"] == 2
-    assert {"start", "reading", "survey", "planning", "vgg_forward", "writing"} <= set(whole["seconds_by_part"])
     assert sum(whole["seconds_by_part"].values()) == pytest.approx(whole["seconds_total"], abs=0.02)
     assert whole["seconds_total"] < whole["seconds"] + 0.02, "the process ends after its last report"
     assert whole["plan"]["prediction"]["seconds"] > 0
-    for count in ("60", "120"):
-        entry = findings["raster"][count]
-        assert PASSES | {"lists_seconds", "cached_weights"} == set(entry)
-        assert set(entry["cached_weights"]) == PASSES
-    entry = findings["step"]["32x32"]["float32"]
-    assert entry["seconds_in_loop"] > 0
-    assert entry["rasterizer"] == "triton"
-    assert {"vgg_forward", "vgg_backward", "render", "raster_backward"} <= set(entry["seconds_by_part"])
-    assert entry["planned_device_bytes"] is None
+    assert {"60", "120"} <= findings["raster"].keys()
+    assert findings["step"]["32x32"]["float32"]["rasterizer"] == "triton"
     assert len(findings["curve"]["losses"]) == len(findings["curve"]["losses_on_the_cpu"]) == 2
     assert findings["curve"]["loss"]["passed"]
     assert findings["ranks"]["colors"]["passed"]

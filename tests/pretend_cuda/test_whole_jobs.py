@@ -73,14 +73,13 @@ def run_job(job: Job, steps: int | None = None) -> Result:
     return execute(job, listener, checkpoint_seconds=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "scan", "gray", "settings"),
     [
-        pytest.param("preview", False, True, {"position_weights": "off"}, marks=pytest.mark.slow),
-        pytest.param("standard", True, False, {"precision": "bfloat16", "views_per_step": 2}, marks=pytest.mark.slow),
-        pytest.param(
-            "paper", False, False, {"position_weights": "off", "cached_weights": "half"}, marks=pytest.mark.slow
-        ),
+        ("preview", False, True, {"position_weights": "off"}),
+        ("standard", True, False, {"precision": "bfloat16", "views_per_step": 2}),
+        ("paper", False, False, {"position_weights": "off", "cached_weights": "half"}),
     ],
 )
 def test_job_runs_resumes_and_reports(

@@ -23,7 +23,6 @@ from sgsst_core.features.network_weights import (
     BackboneWeights,
     _require_space,
     fetch_network_weights,
-    list_network_weights,
     load_network_weights,
     load_perceptual,
 )
@@ -129,16 +128,6 @@ def test_features_equal_kappa_times_the_normalized_networks(vgg19_folder: Path) 
     pairs = zip(features(load_network_weights("vgg19", vgg19_folder), rgb), features(normalized, rgb), strict=True)
     for scaled, plain in pairs:
         torch.testing.assert_close(scaled, plain * sources.KAPPA, rtol=1e-5, atol=1e-5 * float(scaled.max()))
-
-
-def test_torchvision_vgg16_can_be_installed_from_a_file(tmp_path: Path) -> None:
-    layers = random_vgg("vgg16")
-    torch.save(torchvision_state(layers, TORCHVISION_VGG16), tmp_path / "vgg16.pth")
-    fetch_network_weights("vgg16", source=tmp_path / "vgg16.pth", folder=tmp_path)
-    weights = load_network_weights("auto", tmp_path)
-    assert weights.name == "vgg16"
-    for layer, (weight, _) in weights.convolutions.items():
-        assert torch.equal(weight, layers[layer][0])
 
 
 def test_auto_prefers_vgg19(vgg19_folder: Path, folder: Path) -> None:
@@ -290,14 +279,6 @@ def test_unwritable_cache_is_detected_before_the_download(tmp_path: Path) -> Non
     (tmp_path / "file").touch()
     with pytest.raises(WeightsError, match="SGSST_CACHE"):
         fetch_network_weights("vgg19", folder=tmp_path / "file" / "cache")
-
-
-def test_cache_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SGSST_CACHE", str(tmp_path))
-    assert cache_folder() == tmp_path
-    assert all(entry.path is None and entry.size > 0 for entry in list_network_weights())
-    with pytest.raises(WeightsError, match=str(tmp_path)):
-        load_network_weights()
 
 
 @pytest.fixture

@@ -243,7 +243,7 @@ def test_antialiased_scene_is_compared_with_classic(tmp_path: Path) -> None:
     assert finding.done == "as requested"
 
 
-def test_counts_are_those_of_the_reference(tmp_path: Path) -> None:
+def test_counts_are_those_of_the_reference() -> None:
     scene = replace(cloud(2000, log_scale=-3.0), opacities=torch.linspace(-2, 4, 2000))
     small = opaque = 0
     for view in VIEWS:

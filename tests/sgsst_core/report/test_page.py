@@ -269,17 +269,6 @@ def test_losses_outside_of_logarithmic_axes_are_counted(wrong: float, where: str
     assert f"Not shown: {count} of 30 values" in parsed(report).text
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [1e-320, 1e308])
-def test_extreme_losses_are_shown(size: float) -> None:
-    report = losses_alone()
-    for index, record in enumerate(report["history"]):
-        record.update(loss=size, relative=size if index % 2 else 1.0)
-        for terms in record["scales"].values():
-            terms.update(dict.fromkeys(terms, size))
-    parsed(report)
-
-
 def colors_in(path: Path) -> set[tuple[int, ...]]:
     with Image.open(path) as image:
         assert image.format == "PNG"

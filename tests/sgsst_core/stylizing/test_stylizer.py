@@ -116,8 +116,7 @@ def test_loss_halves_and_falls_on_unused_views(tiny_weights: BackboneWeights, sc
     assert left_out.evaluate([0])[0].total < 0.6 * start
 
 
-@pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
-@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize(("style_loss", "precision"), [("nnfm", "bfloat16"), ("mixed", "float32")])
 def test_features_approach_the_style(
     tiny_weights: BackboneWeights, scene: Scene, monkeypatch: pytest.MonkeyPatch, style_loss: str, precision: str
 ) -> None:
