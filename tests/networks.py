@@ -1,6 +1,7 @@
 """Tiny feature networks, which take a negligible fraction of a test's time."""
 
 import functools
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -59,3 +60,12 @@ def _random_layers(name: str) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
             layers[f"conv{block}_{index}"] = weight, torch.randn(CHANNELS, generator=generator)
             channels = CHANNELS
     return layers
+
+
+def flip_a_bit(path: Path) -> None:
+    """Flip one bit of a file without changing its size and times, as a faulty disk does."""
+    status = path.stat()
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))

@@ -10,6 +10,7 @@ import pytest
 
 from tests.api.http.sending import refused
 from tests.api.service import Service, Unready, wait_for
+from tests.networks import flip_a_bit
 
 PARAMETERS = {"preset": "standard", "steps_sos": 3, "backbone": "vgg16", "early_stop": False}
 
@@ -17,15 +18,6 @@ PARAMETERS = {"preset": "standard", "steps_sos": 3, "backbone": "vgg16", "early_
 @pytest.fixture
 def cache(tiny_cache: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(tiny_cache, tmp_path / "cache"))
-
-
-def flip_a_bit(path: Path) -> None:
-    """Flip one bit of a file without changing its size and times, as a faulty disk does."""
-    status = path.stat()
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 4
-    path.write_bytes(content)
-    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ import pytest
 from tests.api.service import ROOT, Service, undisturbed, wait_for
 from tests.api.service import submit as submit_job
 from tests.postgres import fresh_database
-from tests.service.conftest import postgres  # noqa: F401 (a fixture)
-from tests.service.files.s3 import environment_of, s3_server
+from tests.service.conftest import postgres, s3_url  # noqa: F401 (fixtures)
+from tests.service.files.s3 import environment_of
 from tests.small_scenes import input_files
 
 pytestmark = pytest.mark.slow
@@ -31,12 +30,6 @@ PARAMETERS = {
     "precision": "float32",
     "seed": 3,
 }
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[str]:
-    with s3_server() as url:
-        yield url
 
 
 def bucket(s3: str, name: str) -> dict[str, str]:
@@ -87,7 +80,7 @@ def test_jobs_continue_after_a_restore(
     if kind == "servers":
         if shutil.which("pg_dump") is None:
             pytest.skip("pg_dump is missing: apt-get install -y postgresql-client")
-        server, s3 = request.getfixturevalue("postgres"), request.getfixturevalue("s3")
+        server, s3 = request.getfixturevalue("postgres"), request.getfixturevalue("s3_url")
         before = {**bucket(s3, "old"), "SGSST_DATABASE": fresh_database(server)}
         after = {**bucket(s3, "new"), "SGSST_DATABASE": fresh_database(server)}
     saved = tmp_path / "backup"

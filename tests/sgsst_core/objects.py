@@ -1,4 +1,4 @@
-"""Synthetic scenes for tests of orbits, with y pointing down as in captured scenes."""
+"""Synthetic scenes and cameras for tests of orbits, with y pointing down as in captured scenes."""
 
 import math
 from dataclasses import replace
@@ -7,6 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
 
 UP = (0.0, -1.0, 0.0)
@@ -81,3 +82,21 @@ def moved(scene: Scene, turn: Rotation, factor: float = 1.0, shift: tuple[float,
         quats=torch.from_numpy(quats).roll(1, 1).float(),
         scales=scene.scales + math.log(factor),
     )
+
+
+def ring(count: int, radius: float = 3.0) -> list[Camera]:
+    """Return cameras on a circle around the origin that look at it."""
+    origin, up = torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])
+    angles = [2 * math.pi * i / count for i in range(count)]
+    return [
+        look_at(
+            str(i),
+            torch.tensor([radius * math.sin(a), 0, radius * math.cos(a)]),
+            origin,
+            up,
+            width=64,
+            height=48,
+            focal=60,
+        )
+        for i, a in enumerate(angles)
+    ]

@@ -35,6 +35,7 @@ from sgsst_core.features.weight_files import (
     digest_of_bytes,
     verify,
 )
+from tests.networks import flip_a_bit
 
 TORCHVISION_VGG19 = [0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28, 30, 32, 34]
 TORCHVISION_VGG16 = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
@@ -289,15 +290,6 @@ def folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def flip(path: Path, position: int, bit: int = 0) -> None:
-    """Flip one bit of a file without changing its times."""
-    status = path.stat()
-    content = bytearray(path.read_bytes())
-    content[position] ^= 1 << bit
-    path.write_bytes(content)
-    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
-
-
 @pytest.mark.parametrize("name", PACKAGE_FILES)
 def test_package_files_match_digests_in_the_code(name: str, vgg16_weights: BackboneWeights) -> None:
     with (cache_folder() / f"{name}.safetensors").open("rb") as stream:
@@ -345,7 +337,7 @@ def test_damaged_files_are_named_with_a_repair_command(folder: Path, tiny_cache:
     assert damaged_weights(folder) == []
     for name in ("vgg16", "lpips_alex"):
         path = folder / f"{name}.safetensors"
-        flip(path, path.stat().st_size // 2)
+        flip_a_bit(path)
         path.touch()
     damaged = damaged_weights(folder)
     assert len(damaged) == 2
@@ -357,7 +349,7 @@ def test_damaged_files_are_named_with_a_repair_command(folder: Path, tiny_cache:
 
 def test_fetch_replaces_damaged_weights_from_a_file(tiny_cache: Path, tmp_path: Path) -> None:
     path = Path(shutil.copy(tiny_cache / "vgg16.safetensors", tmp_path))
-    flip(path, -1, 7)
+    flip_a_bit(path)
     assert damaged_weights(tmp_path)
     fetch_network_weights("vgg16", source=tiny_cache / "narrow.pth", folder=tmp_path)
     assert damaged_weights(tmp_path) == []

@@ -36,7 +36,7 @@ from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Style
-from tests.sgsst_core.objects import joined
+from tests.sgsst_core.objects import joined, ring
 from tests.sgsst_core.splat_scenes import displaced
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
@@ -70,24 +70,6 @@ def angle_between(first: Camera, second: Camera) -> float:
         [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
     )
     return math.atan2(float(sine.norm()) / 2, (float(relative.trace()) - 1) / 2)
-
-
-def ring(count: int, radius: float = 3.0) -> list[Camera]:
-    """Return cameras on a circle around the origin that look at it."""
-    origin, up = torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])
-    angles = [2 * math.pi * i / count for i in range(count)]
-    return [
-        look_at(
-            str(i),
-            torch.tensor([radius * math.sin(a), 0, radius * math.cos(a)]),
-            origin,
-            up,
-            width=64,
-            height=48,
-            focal=60,
-        )
-        for i, a in enumerate(angles)
-    ]
 
 
 def names(novel: list[Camera]) -> list[str]:

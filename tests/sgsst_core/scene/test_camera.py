@@ -38,7 +38,7 @@ from sgsst_core.scene.camera import (
 from sgsst_core.scene.panorama import FACES, OVERLAP, cube_faces, faces_to_render, join_faces, level
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import make_settings
-from tests.sgsst_core.objects import ball, scene_of
+from tests.sgsst_core.objects import ball, ring, scene_of
 
 
 def camera(width: int = 990, height: int = 742, name: str = "a") -> Camera:
@@ -296,18 +296,8 @@ def test_any_cameras_make_a_finite_path(given_poses):
     assert np.allclose(path_poses[:, :3, :3] @ path_poses[:, :3, :3].transpose(0, 2, 1), np.eye(3), atol=1e-9)
 
 
-def ring(count):
-    """Return cameras on half a circle."""
-    up, origin = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
-    angles = [math.pi * index / count for index in range(count)]
-    return [
-        look_at(str(i), torch.tensor([math.cos(a), 0.3, math.sin(a)]), origin, up, width=64, height=48, focal=50)
-        for i, a in enumerate(angles)
-    ]
-
-
 def test_order_of_the_file_is_kept_unless_it_jumps():
-    cameras = ring(20)
+    cameras = ring(40)[:20]
     assert (in_path_order(cameras), in_path_order(cameras[::-1])) == (cameras, cameras[::-1])
     shuffled = [cameras[(index * 7) % 20] for index in range(20)]
     assert [c.name for c in in_path_order(shuffled)] == [str(index) for index in range(20)]
