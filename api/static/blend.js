@@ -1,7 +1,7 @@
 // @ts-check
 /** Control of a blend of the original with one or two results; the viewer shows it exactly. */
 import { artifactPath, ask } from "./api.js";
-import { announce, h, newId, put } from "./dom.js";
+import { announce, h, messageOf, newId, put } from "./dom.js";
 import { resultName } from "./names.js";
 import { resultFormats } from "./tables.js";
 import { words } from "./words.js";
@@ -104,7 +104,7 @@ export class Blend {
       put(this.note, say.saved, " ", h("a", { href, download: "" }, name.split("/").pop()));
       announce(say.saved);
     } catch (error) {
-      put(this.note, error instanceof Error ? error.message : String(error));
+      put(this.note, messageOf(error));
     }
     this.button.disabled = false;
   }

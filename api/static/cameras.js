@@ -1,6 +1,6 @@
 // @ts-check
 /** Cameras of a job: read from files, or on a ring around an object; and the lines that draw them as small frames. */
-import { cross, difference, dot, sum, times, unit } from "./viewer/vectors.js";
+import { cross, difference, dot, sum, times, turnOf, unit } from "./viewer/vectors.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./viewer/vectors.js").Vector} Vector */
@@ -74,11 +74,7 @@ function colmapCameras(images, intrinsics) {
     while (view.getUint8(end)) end++;
     const name = new TextDecoder().decode(new Uint8Array(images, at + 64, end - at - 64));
     at = end + 9 + 24 * Number(view.getBigUint64(end + 1, true));
-    const axes = [
-      [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-      [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-      [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ];
+    const axes = turnOf([x, y, z, w]);
     const pose = { name, position: axes.map((axis, i) => times(axis, -t[i])).reduce(sum), axes, width, height };
     found.push({ name, cameras: focal.length ? [checked({ ...pose, fx: focal[0], fy: focal[1] })] : cubeFaces(pose) });
   }

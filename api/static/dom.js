@@ -63,6 +63,15 @@ export function put(element, ...children) {
   return element;
 }
 
+/** Show a text in an element, or hide it without one. @param {HTMLElement} element @param {string} text */
+export function tell(element, text) {
+  element.hidden = !text;
+  element.textContent = text;
+}
+
+/** Return the message of an error. @param {unknown} error */
+export const messageOf = (error) => (error instanceof Error ? error.message : String(error));
+
 let last = 0;
 /** Return an id that no other element has. */
 export const newId = () => `i${++last}`;

@@ -3,7 +3,7 @@
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { LossChart } from "./chart.js";
 import { deleteButton } from "./fields.js";
-import { announce, h, put } from "./dom.js";
+import { announce, h, messageOf, put } from "./dom.js";
 import { baseOf, startFrom } from "./stored.js";
 import { actionsOf, installed, statusTitles, UNFINISHED, WORKING } from "./tables.js";
 import { downloadCard, factsCard, filesCard, JobName, JobProgress, outcomeOf, ShareCard, VideoCard } from "./job_cards.js";
@@ -252,7 +252,7 @@ export class JobView {
   /** @param {unknown} error */
   tellError(error) {
     this.error.hidden = false;
-    put(this.error, h("p", error instanceof Error ? error.message : String(error)));
+    put(this.error, h("p", messageOf(error)));
   }
 
   async loadFiles() {

@@ -1,7 +1,7 @@
 // @ts-check
 /** Parts of a job's view: its name, progress, result, files, inputs, links for others, and video. */
 import { artifactPath, ask, eventsOf, get, Problem } from "./api.js";
-import { announce, h, icon, put } from "./dom.js";
+import { announce, h, icon, messageOf, put, tell } from "./dom.js";
 import { titleOf, valueText } from "./options.js";
 import { downloads, installed, statusTitles, UNFINISHED } from "./tables.js";
 import { size, time, words } from "./words.js";
@@ -151,13 +151,8 @@ export class ShareCard {
 
   /** @param {() => Promise<void>} act */
   async act(act) {
-    this.wrong.hidden = true;
-    try {
-      await act();
-    } catch (error) {
-      this.wrong.hidden = false;
-      this.wrong.textContent = error instanceof Error ? error.message : String(error);
-    }
+    tell(this.wrong, "");
+    await act().catch((error) => tell(this.wrong, messageOf(error)));
   }
 
   async create() {
@@ -239,7 +234,7 @@ export class VideoCard {
 
   async make() {
     this.button.disabled = true;
-    this.failure.hidden = true;
+    tell(this.failure, "");
     this.tell(words.video.starting);
     const json = { path: this.path.value, seconds: Number(this.seconds.value), resolution: Number(this.size.value) || null, compare: this.compare.checked };
     try {
@@ -252,8 +247,7 @@ export class VideoCard {
       announce(words.video.made);
     } catch (error) {
       if (this.signal.aborted) return;
-      this.failure.hidden = false;
-      this.failure.textContent = error instanceof Error ? error.message : String(error);
+      tell(this.failure, messageOf(error));
     }
     this.button.disabled = false;
     this.text.textContent = "";

@@ -1,8 +1,7 @@
 // @ts-check
 /** 3D view of a job: previews and its colors so far while it runs, then its result. */
-import { artifactPath, get } from "./api.js";
+import { artifactPath } from "./api.js";
 import { h, put } from "./dom.js";
-import { labels } from "./names.js";
 import { PaintPanel } from "./paint_panel.js";
 import { LIVE, ResultStage } from "./result_stage.js";
 import { Stage } from "./stage.js";
@@ -145,7 +144,7 @@ export class JobStage {
       else tabs.unshift([say.sheet, sheet]);
     }
     const fillSheet = () => put(sheet, h("a", { href: artifactPath(this.id, "before_after.jpg"), target: "_blank", rel: "noopener" }, h("img", { src: artifactPath(this.id, "before_after.jpg"), alt: say.sheetOf(this.title) })));
-    this.showTabs(tabs, (body) => body === sheet && !sheet.firstChild && fillSheet(), this.compareLink(job));
+    this.showTabs(tabs, (body) => body === sheet && !sheet.firstChild && fillSheet());
   }
 
   /** @param {ResultStage} result @param {any} job */
@@ -170,10 +169,9 @@ export class JobStage {
   /**
    * @param {[string, HTMLElement][]} tabs titles and bodies; the first one is opened
    * @param {(body: HTMLElement) => void} [opened] called when a tab is opened
-   * @param {HTMLElement} [beside] element beside the titles
    * @returns {(index: number) => void} function that opens a tab
    */
-  showTabs(tabs, opened = () => {}, beside) {
+  showTabs(tabs, opened = () => {}) {
     const inputs = tabs.map((_, i) => h("input", { type: "radio", name: `tab${this.id}`, onchange: () => ((this.open = () => {}), open(i)) }));
     const open = (/** @type {number} */ at) => {
       inputs[at].checked = true;
@@ -181,22 +179,9 @@ export class JobStage {
       opened(tabs[at][1]);
     };
     const picker = h("fieldset.segments", h("legend.away", say.view3d), tabs.map(([name], i) => h("label", inputs[i], h("span", name))));
-    put(this.element, h("div.row.tabs", picker, beside), tabs.map(([, body]) => body));
+    put(this.element, h("div.row.tabs", picker), tabs.map(([, body]) => body));
     open(0);
     return open;
-  }
-
-  /** Create a link to compare this job with other finished runs of the same scene. @param {any} job */
-  compareLink(job) {
-    const chooser = h("select", { "aria-label": say.compareWith, hidden: true, onchange: () => chooser.value && (location.hash = `#/compare/${this.id}/${chooser.value}`) });
-    const scene = job.inputs.find((/** @type {any} */ input) => input.role === "scene")?.sha256;
-    get("v1/jobs?status=succeeded&limit=100", this.leaving).then(({ jobs }) => {
-      const others = jobs.filter((/** @type {any} */ job) => job.id !== this.id && job.inputs.some((/** @type {any} */ input) => input.role === "scene" && input.sha256 === scene));
-      chooser.hidden = !others.length;
-      const names = labels(others);
-      put(chooser, h("option", { value: "" }, `${say.compare}…`), others.map((/** @type {any} */ job, /** @type {number} */ i) => h("option", { value: job.id }, names[i])));
-    }).catch(() => {});
-    return chooser;
   }
 
   end() {

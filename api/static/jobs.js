@@ -1,7 +1,7 @@
 // @ts-check
 /** View of all jobs, and the one that compares runs of one scene: side by side, and two of them by the wipe. */
 import { artifactPath, ask, get, Problem } from "./api.js";
-import { announce, h, put } from "./dom.js";
+import { announce, h, messageOf, put, tell } from "./dom.js";
 import { deleteButton } from "./fields.js";
 import { badge } from "./job.js";
 import { labels, nameOf, stylesOf } from "./names.js";
@@ -49,20 +49,15 @@ export class JobsView {
       // a job that should be on this page of the list, but is not, was deleted
       this.jobs = [...known.values()].filter((job) => more || newest.has(job.id) || (found.next_cursor && job.id < last)).sort((a, b) => (a.id < b.id ? 1 : -1));
       if (more || !this.cursor) this.cursor = found.next_cursor;
-      this.problem.hidden = true;
+      tell(this.problem, "");
       this.show();
     } catch (error) {
       if (this.leaving.signal.aborted) return;
-      this.problem.hidden = false;
-      this.problem.textContent = error instanceof Error ? error.message : String(error);
+      tell(this.problem, messageOf(error));
       put(this.element, this.body);
     }
     const running = this.jobs.some((job) => UNFINISHED.has(job.status));
-    this.timer = setTimeout(() => (document.hidden ? this.later() : this.load(false)), running ? OFTEN : SELDOM);
-  }
-
-  later() {
-    document.addEventListener("visibilitychange", () => this.load(false), { once: true, signal: this.leaving.signal });
+    this.timer = later(() => this.load(false), running ? OFTEN : SELDOM, this.leaving.signal);
   }
 
   show() {
@@ -86,12 +81,11 @@ export class JobsView {
     if (known?.told === told || known?.element.contains(document.activeElement)) return known.element;
     const name = nameOf(job), style = stylesOf(job);
     const running = UNFINISHED.has(job.status), done = job.status === "succeeded", painted = stepFraction(job);
-    const picture = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: "", loading: "lazy", decoding: "async" }) : h("span.blank", { "aria-hidden": "true" });
     const early = done && job.result?.steps < job.result?.total;
     const choose = done ? h("label.check", h("input", { type: "checkbox", checked: this.chosen.has(job.id), "aria-label": say.select(name), onchange: (/** @type {any} */ event) => this.choose(job.id, event.target.checked) }), h("small", { "aria-hidden": "true" }, say.choose)) : null;
-    const element = h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", picture), h("strong", { title: name }, name), h("small", [name.includes(style) ? "" : style, time(job.created_at), early && words.job.steps(job.result.steps, job.result.total)].filter(Boolean).join(" · "))),
-      h("div.row", badge(job.status), painted === undefined ? null : h("small", percent(painted)), h("span.grow"), choose, running ? null : this.deleter(job, name)),
-      painted === undefined ? null : h("progress", { max: 1, value: painted, "aria-label": words.job.progress }));
+    const facts = [name.includes(style) ? "" : style, time(job.created_at), early && words.job.steps(job.result.steps, job.result.total)].filter(Boolean).join(" · ");
+    const element = tile(job, name, { loading: "lazy" }, h("small", facts), [h("span.grow"), choose, running ? null : this.deleter(job, name)]);
+    if (painted !== undefined) element.append(h("progress", { max: 1, value: painted, "aria-label": words.job.progress }));
     this.cards.set(job.id, { element, told });
     return element;
   }
@@ -107,10 +101,7 @@ export class JobsView {
       this.show();
       const links = [...this.list.querySelectorAll("li > a")], next = links[Math.min(at, links.length - 1)] ?? this.element.querySelector("a");
       /** @type {HTMLElement | null} */ (next)?.focus();
-    }, (error) => {
-      this.problem.hidden = false;
-      this.problem.textContent = error instanceof Error ? error.message : String(error);
-    }, say.remove(name));
+    }, (error) => tell(this.problem, messageOf(error)), say.remove(name));
   }
 
   /** @param {string} id @param {boolean} on */
@@ -122,12 +113,8 @@ export class JobsView {
 
   compareChosen() {
     const ids = [...this.chosen], scenes = new Set(ids.map((id) => sceneOf(this.jobs.find((job) => job.id === id))));
-    if (scenes.size > 1) {
-      this.problem.hidden = false;
-      this.problem.textContent = say.otherScenes;
-      return;
-    }
-    location.hash = `#/compare/${ids.join("/")}`;
+    if (scenes.size > 1) tell(this.problem, say.otherScenes);
+    else location.hash = `#/compare/${ids.join("/")}`;
   }
 
   end() {
@@ -153,16 +140,13 @@ export class CompareView {
     try {
       const jobs = await Promise.all(this.ids.map((id) => get(`v1/jobs/${id}`, this.leaving.signal)));
       this.show(jobs);
-      if (jobs.some((job) => UNFINISHED.has(job.status))) this.timer = setTimeout(() => (document.hidden ? this.later() : this.load()), OFTEN);
+      if (jobs.some((job) => UNFINISHED.has(job.status))) this.timer = later(() => this.load(), OFTEN, this.leaving.signal);
       else this.showStage(jobs.filter((job) => job.status === "succeeded"));
     } catch (error) {
       if (this.leaving.signal.aborted) return;
-      put(this.element, h("div.empty", h("h1", error instanceof Problem && error.status === 404 ? words.job.gone : words.page.error), h("p", error instanceof Error && !(error instanceof Problem && error.status === 404) ? error.message : words.compare.notThere), h("a.button.quiet", { href: "#/jobs" }, words.page.jobs)));
+      const gone = error instanceof Problem && error.status === 404;
+      put(this.element, h("div.empty", h("h1", gone ? words.job.gone : words.page.error), h("p", gone ? words.compare.notThere : messageOf(error)), h("a.button.quiet", { href: "#/jobs" }, words.page.jobs)));
     }
-  }
-
-  later() {
-    document.addEventListener("visibilitychange", () => this.load(), { once: true, signal: this.leaving.signal });
   }
 
   /** @param {any[]} jobs */
@@ -171,7 +155,7 @@ export class CompareView {
     this.heading.textContent = names.length === 2 ? words.compare.heading(names[0], names[1]) : words.compare.several(names.length);
     if (this.heading.parentElement === null) put(this.element, h("header.head", this.heading), this.sheet, this.holder);
     const focused = [...this.sheet.querySelectorAll("a")].indexOf(/** @type {any} */ (document.activeElement));
-    put(this.sheet, jobs.map((job, i) => tile(job, names[i])));
+    put(this.sheet, jobs.map((job, i) => tile(job, names[i], { alt: words.job.sheetOf(names[i]) })));
     if (focused >= 0) this.sheet.querySelectorAll("a")[focused]?.focus();
   }
 
@@ -190,10 +174,23 @@ export class CompareView {
   }
 }
 
-/** Return the image of a job with its label and status. @param {any} job @param {string} name */
-function tile(job, name) {
+/** Act after a time, but not while the page is hidden. @param {() => void} act @param {number} milliseconds @param {AbortSignal} signal */
+function later(act, milliseconds, signal) {
+  return setTimeout(() => (document.hidden ? document.addEventListener("visibilitychange", act, { once: true, signal }) : act()), milliseconds);
+}
+
+/**
+ * Return the image of a job with its label and status.
+ *
+ * @param {any} job
+ * @param {string} name
+ * @param {Record<string, string>} how properties of the image
+ * @param {HTMLElement | null} [facts] element below the name
+ * @param {any[]} [tools] elements beside the status
+ */
+function tile(job, name, how, facts = null, tools = []) {
   const painted = stepFraction(job);
-  const image = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: words.job.sheetOf(name), decoding: "async" }) : h("span.blank", { "aria-hidden": "true" });
-  return h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", image), h("strong", { title: name }, name)),
-    h("div.row", badge(job.status), painted === undefined ? null : h("small", percent(painted))));
+  const image = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: "", decoding: "async", ...how }) : h("span.blank", { "aria-hidden": "true" });
+  return h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", image), h("strong", { title: name }, name), facts),
+    h("div.row", badge(job.status), painted === undefined ? null : h("small", percent(painted)), tools));
 }

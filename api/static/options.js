@@ -1,13 +1,11 @@
 // @ts-check
 /** Inputs for a job's parameters, generated from the API's OpenAPI document; the strength is chosen by pictures. */
-import { h, newId } from "./dom.js";
+import { h, newId, tell } from "./dom.js";
 import { seconds, words } from "./words.js";
 
 /**
  * @typedef {object} Control
  * @property {string} name
- * @property {string} title
- * @property {string} help
  * @property {HTMLElement} element
  * @property {() => any} value undefined if the preset decides
  * @property {(value: any) => void} set
@@ -39,23 +37,25 @@ export function optionControl(name, schema, { title = titleOf(name), hint = true
   const id = newId(), kinds = variants(schema), shown = words.options.defaults[name];
   const preset = schema["x-default"] ?? schema.default ?? "", onOff = preset === true ? words.submit.on : preset === false ? words.submit.off : preset;
   const fallback = shown ?? String(onOff);
-  const [input, read, suggest] = inputFor(kinds, id);
+  const [input, read, suggest, listed = []] = inputFor(kinds);
   suggest(fallback);
   const error = h("p.wrong", { id: `${id}e`, hidden: true });
   const unit = words.options.units[name] ?? (kinds.some(isNumber) ? schema["x-unit"] : ""), told = words.options.help[name] ?? schema.description;
   const help = hint && told ? h("p.help", { id: `${id}h` }, told) : null;
+  const list = listed.length ? h("datalist", { id: `${id}l` }, listed.map((value) => h("option", { value }))) : null;
   input.id = id;
+  if (list) input.setAttribute("list", list.id);
   input.setAttribute("aria-describedby", [help && `${id}h`, `${id}e`].filter(Boolean).join(" "));
-  const element = h("div.option", { "data-name": name }, h("label", { htmlFor: id }, title), h("div.value", input, unit ? h("span.unit", unit) : null), help, error);
+  const element = h("div.option", { "data-name": name }, h("label", { htmlFor: id }, title), h("div.value", input, list, unit ? h("span.unit", unit) : null), help, error);
   const factor = words.options.factors[name] ?? 1, parsed = (/** @type {string} */ text) => (typeof read(text) === "number" ? factor * read(text) : read(text));
   const wrong = (/** @type {string} */ text) => showWrong(input, error, text);
   input.addEventListener("input", () => wrong(""));
   return {
-    name, title, help: `${told ?? ""} ${schema.description ?? ""}`, element, wrong, suggest,
+    name, element, wrong, suggest,
     value: () => parsed(input.value),
     set: (value) => void (input.value = value === undefined || value === null ? "" : String(factor === 1 ? value : value / factor)),
     follow: (preset) => suggest(schema["x-presets"]?.[preset] ?? fallback),
-    problem: () => (input.validity?.badInput ? words.refusals.notNumber : problemOf(kinds, read(input.value))),
+    problem: () => (input.validity.badInput ? words.refusals.notNumber : problemOf(kinds, read(input.value))),
   };
 }
 
@@ -108,28 +108,27 @@ export function plainly(message) {
 
 /** @param {HTMLElement} input @param {HTMLElement} error @param {string} text */
 export function showWrong(input, error, text) {
-  error.hidden = !text;
-  error.textContent = text;
+  tell(error, text);
   input.toggleAttribute("aria-invalid", !!text);
   if (text) input.setAttribute("aria-invalid", "true");
 }
 
 /**
  * @param {any[]} kinds
- * @param {string} id
- * @returns {[any, (text: string) => any, (fallback: string) => void]} input, parser of its text, and how it shows a default
+ * @returns {[any, (text: string) => any, (fallback: string) => void, string[]?]} input, parser of its text, how it shows a default, and values to list
  */
-function inputFor(kinds, id) {
-  const words_ = kinds.flatMap(choices);
-  const chosen = (/** @type {[string, string][]} */ options, /** @type {(text: string) => any} */ read) => {
+function inputFor(kinds) {
+  const listed = kinds.flatMap(choices);
+  /** @type {(options: string[][], read: (text: string) => any) => [any, (text: string) => any, (fallback: string) => void]} */
+  const chosen = (options, read) => {
     const first = h("option", { value: "" });
     const suggest = (/** @type {string} */ fallback) => (first.textContent = fallback ? words.submit.byDefault(fallback) : "–");
-    return /** @type {[any, (text: string) => any, (fallback: string) => void]} */ ([h("select", first, options.map(([value, text]) => h("option", { value }, text))), read, suggest]);
+    return [h("select", first, options.map(([value, text]) => h("option", { value }, text))), read, suggest];
   };
   if (kinds.every((kind) => kind.type === "boolean")) {
     return chosen([["true", words.submit.on], ["false", words.submit.off]], (text) => (text ? text === "true" : undefined));
   }
-  if (kinds.every((kind) => choices(kind).length)) return chosen(words_.map((value) => [value, value]), (text) => text || undefined);
+  if (kinds.every((kind) => choices(kind).length)) return chosen(listed.map((value) => [value, value]), (text) => text || undefined);
   const input = h("input", { type: "text", autocomplete: "off" }), suggest = (/** @type {string} */ fallback) => void (input.placeholder = fallback);
   if (kinds.length === 1 && isNumber(kinds[0])) {
     const [kind] = kinds;
@@ -141,25 +140,8 @@ function inputFor(kinds, id) {
   if (kinds.some((kind) => kind.type === "array") && !kinds.some((kind) => kind.type === "string")) {
     return [input, (text) => (text.trim() ? text.split(/[\s,;]+/).filter(Boolean).map((part) => (isNaN(Number(part)) ? part : Number(part))) : undefined), suggest];
   }
-  if (!words_.length) return [input, (text) => text.trim() || undefined, suggest];
-  input.setAttribute("list", `${id}l`);
-  const holder = h("div.listed", input, h("datalist", { id: `${id}l` }, words_.map((value) => h("option", { value }))));
-  Object.defineProperties(holder, { value: { get: () => input.value, set: (text) => (input.value = text) } });
-  return [aliased(holder, input), (text) => (text.trim() === "" ? undefined : isNaN(Number(text)) ? text.trim() : Number(text)), suggest];
-}
-
-/**
- * Make the id and the description of a wrapper those of its input.
- *
- * @param {any} holder
- * @param {HTMLInputElement} input
- */
-function aliased(holder, input) {
-  Object.defineProperty(holder, "id", { set: (value) => (input.id = value), get: () => input.id });
-  holder.setAttribute = (/** @type {string} */ name, /** @type {string} */ value) => input.setAttribute(name, value);
-  holder.toggleAttribute = (/** @type {string} */ name, /** @type {boolean} */ on) => input.toggleAttribute(name, on);
-  holder.focus = () => input.focus();
-  return holder;
+  if (!listed.length) return [input, (text) => text.trim() || undefined, suggest];
+  return [input, (text) => (text.trim() === "" ? undefined : isNaN(Number(text)) ? text.trim() : Number(text)), suggest, listed];
 }
 
 const say = words.strengths;

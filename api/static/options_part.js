@@ -1,9 +1,9 @@
 // @ts-check
-/** Options of a new job: presets with their estimated times, and groups of options that can be searched. */
-import { ask, get } from "./api.js";
+/** Options of a new job: presets, and groups of options. */
+import { get } from "./api.js";
 import { h, newId, put } from "./dom.js";
 import { addPictures, optionControl } from "./options.js";
-import { seconds, words } from "./words.js";
+import { words } from "./words.js";
 
 /** @typedef {import("./options.js").Control} Control */
 
@@ -24,15 +24,11 @@ export class OptionsPart {
     this.preset = undefined;
     /** Time budget in seconds that suits the service's machine. */
     this.budget = 0;
-    /** Elements with the estimated time of each preset. @type {Map<string, HTMLElement>} */
-    this.times = new Map();
     this.presets = h("fieldset.presets", h("legend", say.preset));
     this.main = h("div.options");
     this.ring = h("div.options");
     this.look = h("div.options");
     this.expert = h("div.options");
-    this.search = h("input", { type: "search", "aria-label": say.find, placeholder: say.find, oninput: () => this.filter() });
-    this.none = h("p.quiet", { hidden: true }, say.noOptions);
     this.lookFold = h("details.fold.group", h("summary", say.lookOptions), this.look);
     this.expertFold = h("details.fold.group", h("summary", say.expertOptions), h("p.help", say.expertHint), this.expert);
   }
@@ -75,7 +71,7 @@ export class OptionsPart {
     this.follow(schema.default);
     put(this.presets, h("legend", say.preset), schema.enum.map((/** @type {string} */ value) => h("label",
       h("input", { type: "radio", name, value, checked: value === schema.default, onchange: () => this.follow(value) }),
-      h("span", h("strong", value), h("small", say.presets[value] ?? ""), this.times.get(value) ?? this.newTime(value)))));
+      h("span", h("strong", value), h("small", say.presets[value] ?? "")))));
   }
 
   /** Choose a preset, unless the service does not have it. @param {string} preset */
@@ -91,56 +87,6 @@ export class OptionsPart {
     this.preset = preset;
     for (const control of this.controls.values()) control.follow(preset);
     if (this.controls.get("within")?.value() !== undefined) for (const name of ["resolution", "views"]) this.controls.get(name)?.suggest(say.byTime);
-  }
-
-  /** Create the element for the estimated time of a preset. @param {string} preset */
-  newTime(preset) {
-    const element = h("small.time");
-    this.times.set(preset, element);
-    return element;
-  }
-
-  /** Discard the estimated times of the presets, which were made for other files or options. */
-  forgetTimes() {
-    this.timing?.abort();
-    for (const element of this.times.values()) element.textContent = "";
-  }
-
-  /**
-   * Show the estimated time at each preset. The other presets are estimated one after another; the service remembers
-   * what it has planned.
-   *
-   * @param {any} body job whose plan is known
-   * @param {any} view its plan
-   */
-  async showTimes(body, view) {
-    this.forgetTimes();
-    const { signal } = (this.timing = new AbortController());
-    const tell = (/** @type {string} */ preset, /** @type {any} */ { total_seconds: total }) => void (/** @type {any} */ (this.times.get(preset)).textContent = total === null ? "" : say.about(seconds(total)));
-    tell(body.parameters.preset, view);
-    for (const preset of this.times.keys()) {
-      if (preset === body.parameters.preset || signal.aborted) continue;
-      try {
-        tell(preset, await (await ask("POST", "v1/jobs?dry_run=true", { json: { ...body, parameters: { ...body.parameters, preset } }, signal })).json());
-      } catch {
-        // this preset is shown without a time
-      }
-    }
-  }
-
-  filter() {
-    const wanted = this.search.value.trim().toLowerCase();
-    let shown = 0;
-    for (const { name, title, help, element } of this.controls.values()) {
-      if (!this.groups.Look.includes(name) && !this.groups.Expert.includes(name)) continue;
-      element.hidden = !!wanted && !`${title} ${name.replaceAll("_", " ")} ${name} ${help}`.toLowerCase().includes(wanted);
-      shown += element.hidden ? 0 : 1;
-    }
-    this.none.hidden = shown > 0;
-    for (const fold of [this.lookFold, this.expertFold]) {
-      if (wanted) fold.open = true;
-      fold.hidden = ![...fold.querySelectorAll(".option")].some((/** @type {any} */ element) => !element.hidden);
-    }
   }
 
   /** Return the values that are not left to the preset, by name. @param {Control[]} [controls] @returns {Record<string, any>} */

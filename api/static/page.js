@@ -6,7 +6,7 @@
  */
 import { ask, get, Problem, whenKeyIsNeeded } from "./api.js";
 import { CompareView, JobsView } from "./jobs.js";
-import { announce, h, icon, newId, put } from "./dom.js";
+import { announce, h, icon, messageOf, newId, put, tell } from "./dom.js";
 import { JobView } from "./job.js";
 import { forgetDraft, keptDraft } from "./stored.js";
 import { SubmitView } from "./submit.js";
@@ -46,7 +46,7 @@ function show(next) {
   view = next;
   put(main, next.element);
   document.title = say.title(next.title);
-  const here = location.hash.startsWith("#/jobs") || location.hash.startsWith("#/compare") ? "#/jobs" : "#/";
+  const here = /^#\/(jobs|compare)/.test(location.hash) ? "#/jobs" : "#/";
   for (const link of links) link.toggleAttribute("aria-current", link.getAttribute("href") === here);
   for (const link of links) if (link.hasAttribute("aria-current")) link.setAttribute("aria-current", "page");
 }
@@ -109,14 +109,13 @@ class SignInView {
 
   /** @param {() => void} done */
   async send(done) {
-    this.wrong.hidden = true;
+    tell(this.wrong, "");
     try {
       await ask("POST", "v1/session", { json: { key: this.input.value.trim() } });
       this.input.value = "";
       done();
     } catch (error) {
-      this.wrong.hidden = false;
-      this.wrong.textContent = error instanceof Problem && error.status === 401 ? words.signIn.wrong : error instanceof Error ? error.message : String(error);
+      tell(this.wrong, error instanceof Problem && error.status === 401 ? words.signIn.wrong : messageOf(error));
       this.input.focus();
     }
   }

@@ -1,10 +1,9 @@
 // @ts-check
 /** Panel to paint on the current view: with a brush, or with an image painted elsewhere. The scene follows as a new job. */
-import { announce, h, icon } from "./dom.js";
+import { announce, h, icon, messageOf, tell } from "./dom.js";
 import { button, range } from "./fields.js";
 import { statedCamera } from "./cameras.js";
-import { PaintLayer } from "./paint_layer.js";
-import { pngText, withPngText } from "./png_text.js";
+import { PaintLayer, pngText, withPngText } from "./paint_layer.js";
 import { Submission } from "./submission.js";
 import { words } from "./words.js";
 
@@ -88,7 +87,7 @@ export class PaintPanel {
     stage.show(side);
     stage.drawFrames();
     this.layer.open(viewer.frozen[0], viewer.frozen[1]);
-    this.refuse("");
+    tell(this.wrong, "");
     stage.element.scrollIntoView({ block: matchMedia("(max-width: 1000px)").matches ? "start" : "nearest" });
     this.color.focus({ preventScroll: true });
     announce(say.frozen);
@@ -118,12 +117,6 @@ export class PaintPanel {
     this.undo.disabled = this.apply.disabled = !this.layer.marks.length;
   }
 
-  /** @param {string} text what is wrong; "" for nothing */
-  refuse(text) {
-    this.wrong.hidden = !text;
-    this.wrong.textContent = text;
-  }
-
   /** Save the frozen view as an image to paint on. */
   async download() {
     const { viewer } = this.stage;
@@ -138,17 +131,17 @@ export class PaintPanel {
     const image = await createImageBitmap(file).catch(() => null), stated = await statedView(file);
     if (!this.view && !this.freeze()) return;
     const { width, height } = (stated ?? /** @type {StatedView} */ (this.view)).camera;
-    if (!image) return this.refuse(say.notImage(file.name));
-    if (image.width !== width || image.height !== height) return this.refuse(say.otherSize(file.name, [image.width, image.height], [width, height]));
+    if (!image) return tell(this.wrong, say.notImage(file.name));
+    if (image.width !== width || image.height !== height) return tell(this.wrong, say.otherSize(file.name, [image.width, image.height], [width, height]));
     if (stated && JSON.stringify(stated) !== JSON.stringify(this.view)) this.freeze(stated);
-    this.refuse("");
+    tell(this.wrong, "");
     this.layer.add({ image });
   }
 
   /** Create the job in which the scene follows. */
   async send() {
     const { submission, view, base } = this, parameters = Object.entries(base.parameters()).filter(([name, value]) => SHARED.includes(name) && value !== null && value !== undefined);
-    this.refuse("");
+    tell(this.wrong, "");
     this.apply.disabled = this.back.disabled = true;
     submission.restart();
     submission.card.element.hidden = false;
@@ -161,7 +154,7 @@ export class PaintPanel {
       this.thaw();
       base.created(job);
     } catch (error) {
-      if (!this.leaving.aborted && !submission.stopped) this.refuse(error instanceof Error ? error.message : String(error));
+      if (!this.leaving.aborted && !submission.stopped) tell(this.wrong, messageOf(error));
     } finally {
       submission.card.element.hidden = true;
       this.back.disabled = false;

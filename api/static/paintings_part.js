@@ -1,10 +1,8 @@
 // @ts-check
-/** Paintings of a new job: a gallery of earlier and bundled ones, whether several are blended, and the example. */
-import { get } from "./api.js";
+/** Paintings of a new job: a gallery, whether several are blended, and the example. */
 import { h, put } from "./dom.js";
 import { defaultName } from "./names.js";
 import { showWrong } from "./options.js";
-import { storedInputs } from "./stored.js";
 import { choice } from "./views_part.js";
 import { words } from "./words.js";
 
@@ -15,21 +13,21 @@ export class PaintingsPart {
    * @param {import("./slots.js").Slot} slot
    * @param {import("./regions.js").RegionList} regions
    * @param {() => void} changed called after another way to use several paintings was chosen
-   * @param {AbortSignal} signal
-   * @param {HTMLElement} example offer of an example scene
    */
-  constructor(slot, regions, changed, signal, example) {
+  constructor(slot, regions, changed) {
     this.slot = slot;
     this.regions = regions;
     /** Inputs for the shares of the paintings in a blend, by the paintings' names. @type {Record<string, any>} */
     this.weights = {};
-    const gallery = new Gallery((painting) => slot.add([painting]), signal, example);
+    const gallery = h("details.fold", h("summary", words.gallery.title), h("p.help", words.gallery.bundled), h("div.paintings",
+      Object.entries(words.gallery.paintings).map(([name, title]) => h("button.painting", { type: "button", title, "aria-label": words.gallery.use(title), onclick: async () => slot.add([await painting(name)]) },
+        h("img", { src: address(name), alt: "", loading: "lazy", decoding: "async" })))));
     this.blended = choice("paintings", say.blended, true, changed);
     this.apart = choice("paintings", say.apart, false, changed);
     this.together = h("fieldset.segments.wide", { hidden: true }, h("legend.away", say.paintings), this.blended.element, this.apart.element);
     this.shares = h("div.options.shares", { hidden: true });
     this.shareError = h("p.wrong", { hidden: true });
-    this.elements = [slot.element, gallery.element, this.together, this.shares];
+    this.elements = [slot.element, gallery, this.together, this.shares];
   }
 
   /** Paintings that belong to no region. */
@@ -90,50 +88,11 @@ export class PaintingsPart {
   }
 }
 
-/** @typedef {import("./stored.js").Chosen} Chosen */
-
-/** Number of paintings of earlier jobs. */
-const MOST_USED = 6;
-
-export class Gallery {
-  /**
-   * @param {(painting: Chosen) => void} choose
-   * @param {AbortSignal} signal
-   * @param {HTMLElement} example offer of an example scene
-   */
-  constructor(choose, signal, example) {
-    this.choose = choose;
-    this.signal = signal;
-    this.used = h("div", { hidden: true });
-    const bundled = Object.entries(words.gallery.paintings).map(([name, title]) => this.painting(address(name), title, () => painting(name)));
-    this.element = h("details.fold.gallery", { ontoggle: () => this.loadUsed() }, h("summary", words.gallery.title), example, this.used, h("p.help", words.gallery.bundled), h("div.paintings", bundled));
-  }
-
-  /** @param {string} url @param {string} title @param {() => Chosen | Promise<Chosen>} take */
-  painting(url, title, take) {
-    return h("button.painting", { type: "button", title, "aria-label": words.gallery.use(title), onclick: async () => this.choose(await take()) },
-      h("img", { src: url, alt: "", loading: "lazy", decoding: "async" }));
-  }
-
-  /** Show the paintings of the last jobs. Jobs that have expired have none. */
-  async loadUsed() {
-    if (!this.element.open || this.loaded) return;
-    this.loaded = true;
-    const { jobs } = await get("v1/jobs?limit=60", this.signal).catch(() => ({ jobs: [] })), found = new Map();
-    for (const job of jobs) {
-      if (job.status !== "expired") for (const painting of storedInputs(job).style) if (!found.has(painting.sha256)) found.set(painting.sha256, painting);
-    }
-    const shown = [...found.values()].slice(0, MOST_USED);
-    this.used.hidden = !shown.length;
-    put(this.used, h("p.help", words.gallery.used), h("div.paintings", shown.map((painting) => this.painting(painting.url, painting.name, () => painting))));
-  }
-}
-
 /** @param {string} name */
 const address = (name) => new URL(`./paintings/${name}.jpg`, import.meta.url).href;
 
 /** Return a file of the page as if it were chosen from this device. @param {string} url @param {string} name */
-export async function fetched(url, name) {
+async function fetched(url, name) {
   const answer = await fetch(url);
   if (!answer.ok) throw new Error(words.api.status(answer.status));
   const blob = await answer.blob();
@@ -141,7 +100,7 @@ export async function fetched(url, name) {
 }
 
 /** Return a painting of the page. @param {string} name */
-export const painting = (name) => fetched(address(name), `${name}.jpg`);
+const painting = (name) => fetched(address(name), `${name}.jpg`);
 
 /** Name of the example's scene. */
 export const EXAMPLE = "motorcycle.sog";
@@ -149,20 +108,19 @@ export const EXAMPLE = "motorcycle.sog";
 export class ExamplePart {
   /** @param {() => void} start called when a user wants the example */
   constructor(start) {
-    this.buttons = [start, start].map((onclick) => h("button.quiet", { type: "button", onclick }, words.example.start));
-    /** The same offer for two places. @type {HTMLElement[]} */
-    this.offers = this.buttons.map((button) => h("div.example", button, h("small", words.example.credit)));
+    this.button = h("button.quiet", { type: "button", onclick: start }, words.example.start);
+    this.element = h("div.example", this.button, h("small", words.example.credit));
   }
 
   /** Return the files of the example by role. */
   async files() {
-    for (const button of this.buttons) button.textContent = words.example.preparing;
+    this.button.textContent = words.example.preparing;
     try {
       const parts = [EXAMPLE, "cameras.json"].map((name) => fetched(new URL(`./example/${name}`, import.meta.url).href, name));
       const [scene, cameras, style] = await Promise.all([...parts, painting("starry_night")]);
       return { scene: [scene], style: [style], cameras: [cameras] };
     } finally {
-      for (const button of this.buttons) button.textContent = words.example.start;
+      this.button.textContent = words.example.start;
     }
   }
 }

@@ -1,7 +1,7 @@
 // @ts-check
 /** Errors of the form for a new job, shown beside the inputs that caused them. */
 import { Problem } from "./api.js";
-import { announce, h } from "./dom.js";
+import { announce, h, messageOf, tell } from "./dom.js";
 import { plainly } from "./options.js";
 import { StoredFile } from "./stored.js";
 
@@ -26,20 +26,19 @@ export class Refusals {
     for (const slot of Object.values(this.slots)) slot.wrong("");
     for (const control of this.options.controls.values()) control.wrong("");
     this.regions.clearWrong();
-    this.element.hidden = true;
+    tell(this.element, "");
   }
 
   /** Show an error beside the input that caused it. @param {unknown} error */
   show(error) {
-    const text = error instanceof Error ? error.message : String(error);
+    const text = messageOf(error);
     if (error instanceof Problem) {
       if (error.code === "unknown-input") this.askAgain(error.input);
       const told = error.errors.length ? error.errors : [{ at: "", message: text }];
       const placed = [...told].reverse().map(({ at, message }) => this.mark(error.input, at, plainly(message)));
       if (this.reveal() && placed.every(Boolean)) return;
     }
-    this.element.hidden = false;
-    this.element.textContent = text;
+    tell(this.element, text);
   }
 
   /** Ask for files of a slot that have expired on the service. @param {string | undefined} role */

@@ -6,7 +6,7 @@
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
 import { Blend } from "./blend.js";
-import { h, put } from "./dom.js";
+import { h, messageOf, put } from "./dom.js";
 import { labels, nameOf, resultName } from "./names.js";
 import { Stage } from "./stage.js";
 import { directionOf, UPS } from "./upright.js";
@@ -270,7 +270,7 @@ export class ResultStage {
 
   /** @param {unknown} error */
   tell(error) {
-    if (!this.signal.aborted) this.stage.message(error instanceof Error ? error.message : String(error));
+    if (!this.signal.aborted) this.stage.message(messageOf(error));
   }
 
   end() {

@@ -71,7 +71,7 @@ export class SelectPanel {
     put(this.element = h("section.selecting", { hidden: true }), h("div.row", this.parts.title, this.counted),
       h("div.row", this.parts.toolRadios, this.parts.modeRadios), this.parts.toolHelp,
       h("div.row", this.parts.radius.element, this.parts.through.element, this.parts.tolerance.element, this.parts.connected.element, this.parts.middle, this.parts.numbers, this.parts.apply),
-      h("div.row", this.parts.undo, this.parts.redo, button(say.invert, () => this.ask("invert")), button(say.grow, () => this.ask("grow")), button(say.clear, () => this.ask("clear")),
+      h("div.row", this.parts.undo, this.parts.redo, button(say.invert, () => this.ask("invert")), button(say.clear, () => this.ask("clear")),
         h("span.spring"), button(say.cancel, () => this.close(null)), button(say.done, () => this.done(), "primary")));
     this.element.setAttribute("aria-label", say.name);
     this.choose("move");

@@ -6,7 +6,7 @@ import { words } from "./words.js";
 
 /** @typedef {import("./viewer/viewer.js").Viewer} Viewer */
 /** @typedef {import("./viewer/vectors.js").Vector} Vector */
-/** @typedef {{kind: "box", center: Vector, sizes: Vector} | {kind: "sphere", center: Vector, sizes: Vector}} Shape `sizes`: half of the sides of a box, or the radius of a sphere three times */
+/** @typedef {{kind: "box" | "sphere", center: Vector, sizes: Vector}} Shape `sizes`: half of the sides of a box, or the radius of a sphere three times */
 
 const say = words.select;
 const AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
@@ -36,105 +36,6 @@ export function outline({ kind, center, sizes }) {
   return new Float32Array(points);
 }
 
-export class ShapeHandles {
-  /**
-   * @param {Viewer} viewer
-   * @param {HTMLElement} layer element that covers the canvas
-   * @param {() => void} changed called after a handle has changed the shape
-   */
-  constructor(viewer, layer, changed) {
-    this.viewer = viewer;
-    this.layer = layer;
-    this.changed = changed;
-    /** @type {Shape | null} */
-    this.shape = null;
-    /** @type {{element: HTMLElement, place: () => Vector}[]} */
-    this.handles = [];
-  }
-
-  /** @param {Shape | null} shape */
-  show(shape) {
-    if (shape?.kind !== this.shape?.kind) {
-      this.handles.forEach(({ element }) => element.remove());
-      this.handles = shape ? [this.moving(), ...(shape.kind === "box" ? AXES.flatMap((_, axis) => [this.sizing(axis, 1), this.sizing(axis, -1)]) : [this.sizing(0, 1)])] : [];
-    }
-    this.shape = shape;
-    this.place();
-  }
-
-  /** Place the handles where the camera shows them. */
-  place() {
-    if (!this.shape) return;
-    const { camera, canvas } = this.viewer, [fx, fy] = camera.pixels(canvas.clientWidth, canvas.clientHeight);
-    for (const { element, place } of this.handles) {
-      const [x, y, z] = camera.axes.map((axis) => dot(axis, difference(place(), camera.eye)));
-      const left = canvas.clientWidth / 2 + (fx * x) / z, top = canvas.clientHeight / 2 + (fy * y) / z;
-      element.hidden = !(z > camera.near);
-      element.style.left = `${Math.max(0, Math.min(canvas.clientWidth, left))}px`;
-      element.style.top = `${Math.max(0, Math.min(canvas.clientHeight, top))}px`;
-    }
-  }
-
-  /** Return a handle that moves the shape across the view. */
-  moving() {
-    return this.handle(say.moveShape, () => this.at, (dx, dy, unit) => {
-      const [right, down] = this.viewer.camera.axes;
-      this.set({ center: sum(this.at, sum(times(right, dx * unit), times(down, dy * unit))) });
-    });
-  }
-
-  /** Return a handle that moves one side of a box, or resizes a sphere. @param {number} axis @param {number} sign */
-  sizing(axis, sign) {
-    const direction = times(AXES[axis], sign);
-    return this.handle(say.resize(["X", "Y", "Z"][axis], sign), () => sum(this.at, times(direction, this.sizes[axis])), (dx, dy, unit) => {
-      const [right, down] = this.viewer.camera.axes, along = [dot(right, direction), dot(down, direction)], length = along[0] ** 2 + along[1] ** 2;
-      const by = ((dx * along[0] + dy * along[1]) * unit) / Math.max(length, 0.05), sizes = [...this.sizes];
-      if (this.shape?.kind === "sphere") return this.set({ sizes: sizes.map((size) => Math.max(1e-6, size + by)) });
-      sizes[axis] = Math.max(1e-6, sizes[axis] + by / 2); // the opposite side stays
-      this.set({ sizes, center: sum(this.at, times(direction, sizes[axis] - this.sizes[axis])) });
-    });
-  }
-
-  get at() {
-    return /** @type {Shape} */ (this.shape).center;
-  }
-
-  get sizes() {
-    return /** @type {Shape} */ (this.shape).sizes;
-  }
-
-  /** @param {Partial<Shape>} values */
-  set(values) {
-    Object.assign(/** @type {Shape} */ (this.shape), values);
-    this.place();
-    this.changed();
-  }
-
-  /**
-   * @param {string} name
-   * @param {() => Vector} place
-   * @param {(dx: number, dy: number, unit: number) => void} drag receives pixels, and the world units of a pixel there
-   */
-  handle(name, place, drag) {
-    const element = h("button.handle", { type: "button", "aria-label": name, title: name });
-    const { camera, canvas } = this.viewer;
-    const by = (/** @type {number} */ dx, /** @type {number} */ dy) => {
-      const depth = dot(camera.axes[2], difference(place(), camera.eye));
-      drag(dx, dy, depth / camera.pixels(canvas.clientWidth, canvas.clientHeight)[0]);
-    };
-    element.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => element.setPointerCapture(event.pointerId));
-    element.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => element.hasPointerCapture(event.pointerId) && by(event.movementX, event.movementY));
-    element.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
-      if (!KEYS[event.key]) return;
-      event.preventDefault();
-      event.stopPropagation();
-      by(...KEYS[event.key]);
-    });
-    this.layer.append(element);
-    return { element, place };
-  }
-}
-
 export class ShapeTool {
   /**
    * @param {import("./stage.js").Stage} stage
@@ -147,17 +48,20 @@ export class ShapeTool {
     this.shape = null;
     /** @type {HTMLInputElement[]} */
     this.inputs = [];
+    /** @type {{element: HTMLElement, place: () => Vector}[]} */
+    this.handles = [];
     this.numbers = h("div.numbers");
-    const layer = h("div.handles");
-    if (stage.viewer) this.handles = new ShapeHandles(stage.viewer, layer, () => this.changed());
-    stage.frame.append(layer);
+    this.layer = h("div.handles");
+    stage.frame.append(this.layer);
   }
 
   /** @param {Shape | null} shape */
   show(shape) {
+    const { viewer } = this.stage, box = shape?.kind === "box";
     this.shape = shape;
-    this.handles?.show(shape);
-    const names = shape ? [...say.center, ...(shape.kind === "box" ? say.sizes : [say.sphereRadius])] : [];
+    this.handles = !shape || !viewer ? [] : [this.moving(shape, viewer), ...(box ? AXES.flatMap((_, axis) => [1, -1].map((sign) => this.sizing(shape, viewer, axis, sign))) : [this.sizing(shape, viewer, 0, 1)])];
+    put(this.layer, this.handles.map(({ element }) => element));
+    const names = shape ? [...say.center, ...(box ? say.sizes : [say.sphereRadius])] : [];
     this.inputs = names.map((name) => h("input", { type: "number", step: "any", "aria-label": name, title: name, oninput: () => this.numbersChanged() }));
     put(this.numbers, this.inputs.map((input, i) => h("label", h("span", names[i]), input)));
     this.changed();
@@ -177,6 +81,57 @@ export class ShapeTool {
     this.draw(outline(shape));
   }
 
+  /** Return a handle that moves the shape across the view. @param {Shape} shape @param {Viewer} viewer */
+  moving(shape, viewer) {
+    return this.handle(say.moveShape, viewer, () => shape.center, (dx, dy, unit) => {
+      const [right, down] = viewer.camera.axes;
+      shape.center = sum(shape.center, sum(times(right, dx * unit), times(down, dy * unit)));
+    });
+  }
+
+  /**
+   * Return a handle that moves one side of a box, or resizes a sphere.
+   *
+   * @param {Shape} shape
+   * @param {Viewer} viewer
+   * @param {number} axis
+   * @param {number} sign
+   */
+  sizing(shape, viewer, axis, sign) {
+    const direction = times(AXES[axis], sign), place = () => sum(shape.center, times(direction, shape.sizes[axis]));
+    return this.handle(say.resize(["X", "Y", "Z"][axis], sign), viewer, place, (dx, dy, unit) => {
+      const [right, down] = viewer.camera.axes, along = [dot(right, direction), dot(down, direction)], length = along[0] ** 2 + along[1] ** 2;
+      const by = ((dx * along[0] + dy * along[1]) * unit) / Math.max(length, 0.05), before = shape.sizes[axis];
+      if (shape.kind === "sphere") return void (shape.sizes = Array(3).fill(Math.max(1e-6, before + by)));
+      shape.sizes[axis] = Math.max(1e-6, before + by / 2);
+      shape.center = sum(shape.center, times(direction, shape.sizes[axis] - before)); // the opposite side stays
+    });
+  }
+
+  /**
+   * @param {string} name
+   * @param {Viewer} viewer
+   * @param {() => Vector} place
+   * @param {(dx: number, dy: number, unit: number) => void} drag receives pixels, and the world units of a pixel there
+   */
+  handle(name, { camera, canvas }, place, drag) {
+    const element = h("button.handle", { type: "button", "aria-label": name, title: name });
+    const by = (/** @type {number} */ dx, /** @type {number} */ dy) => {
+      const depth = dot(camera.axes[2], difference(place(), camera.eye));
+      drag(dx, dy, depth / camera.pixels(canvas.clientWidth, canvas.clientHeight)[0]);
+      this.changed();
+    };
+    element.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => element.setPointerCapture(event.pointerId));
+    element.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => element.hasPointerCapture(event.pointerId) && by(event.movementX, event.movementY));
+    element.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
+      if (!KEYS[event.key]) return;
+      event.preventDefault();
+      event.stopPropagation();
+      by(...KEYS[event.key]);
+    });
+    return { element, place };
+  }
+
   /**
    * Return the change of a selection by what is inside the shape, for `Selection.ask`.
    *
@@ -191,9 +146,17 @@ export class ShapeTool {
 
   /** Keep the handles where the camera shows the shape. */
   follow() {
+    const { viewer } = this.stage;
     cancelAnimationFrame(this.requested ?? 0);
-    if (!this.shape || this.stage.viewer?.ended !== false) return;
-    this.handles?.place();
+    if (!this.shape || !viewer || viewer.ended) return;
+    const { camera, canvas } = viewer, [fx, fy] = camera.pixels(canvas.clientWidth, canvas.clientHeight);
+    for (const { element, place } of this.handles) {
+      const [x, y, z] = camera.axes.map((axis) => dot(axis, difference(place(), camera.eye)));
+      const left = canvas.clientWidth / 2 + (fx * x) / z, top = canvas.clientHeight / 2 + (fy * y) / z;
+      element.hidden = !(z > camera.near);
+      element.style.left = `${Math.max(0, Math.min(canvas.clientWidth, left))}px`;
+      element.style.top = `${Math.max(0, Math.min(canvas.clientHeight, top))}px`;
+    }
     this.requested = requestAnimationFrame(() => this.follow());
   }
 }

@@ -1,7 +1,7 @@
 // @ts-check
 /** The page of a shared result: its viewer with the wipe, and nothing else. In a frame (`embed=1`), the scene rotates. */
 import { ask, get } from "./api.js";
-import { h, put } from "./dom.js";
+import { h, messageOf, put } from "./dom.js";
 import { ResultStage } from "./result_stage.js";
 import { time, words } from "./words.js";
 
@@ -34,7 +34,7 @@ async function show() {
     put(main, embedded ? null : h("header.head", h("div", h("h1.name", view.name), h("p.meta", say.until(time(view.expires_at))))), stage.element);
     if (embedded) present(stage, view.files.includes("poster") ? `${at}/poster` : "", signal).catch(() => {}); // the stage says what is wrong
   } catch (error) {
-    if (!signal.aborted) put(main, h("div.empty", h("h1", say.gone), h("p", error instanceof Error ? error.message : String(error))));
+    if (!signal.aborted) put(main, h("div.empty", h("h1", say.gone), h("p", messageOf(error))));
   }
 }
 

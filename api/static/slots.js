@@ -1,6 +1,6 @@
 // @ts-check
 /** Files of a new job: chosen or dropped, sorted by their names, checked as far as the page can, and listed. */
-import { h, icon, newId, put } from "./dom.js";
+import { h, icon, messageOf, newId, put } from "./dom.js";
 import { showWrong } from "./options.js";
 import { editPainting } from "./painting_editor.js";
 import { contentOf, StoredFile } from "./stored.js";
@@ -131,7 +131,7 @@ export class Slot {
       this.files = this.files.map((each) => (each === file ? made : each));
       this.update();
     } catch (error) {
-      this.wrong(error instanceof Error ? error.message : String(error));
+      this.wrong(messageOf(error));
     }
   }
 

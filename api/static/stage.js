@@ -1,6 +1,6 @@
 // @ts-check
 /** 3D view with its controls: wipe, cameras, screenshots and messages. */
-import { announce, h, icon, newId, put } from "./dom.js";
+import { announce, h, icon, messageOf, newId, put, tell } from "./dom.js";
 import { cameraLines, frameSize, upOf } from "./cameras.js";
 import { fileName } from "./names.js";
 import { Controls } from "./viewer/controls.js";
@@ -54,13 +54,13 @@ export class Stage {
       this.viewer = before?.viewer ?? new Viewer(this.canvas);
     } catch (error) {
       this.element.classList.add("flat");
-      this.message(error instanceof Error ? error.message : String(error));
+      this.message(messageOf(error));
       return;
     }
     this.viewer.told = () => this.told();
     this.controls = before?.controls ?? new Controls(this.viewer);
     this.controls.keys = { moved: () => this.leaveCamera(), toggle: () => this.toggle(), camera: (by) => this.stand(this.stood + by), home: () => this.home(), hold: (held) => this.hold(held) };
-    this.controls.orbit = true;
+    this.controls.motion.orbit = true;
     this.makeTools();
     if (before) {
       before.viewer = null;
@@ -113,19 +113,19 @@ export class Stage {
       await new Headset(viewer, mode, () => button.setAttribute("aria-pressed", "false")).start();
       button.setAttribute("aria-pressed", "true");
     } catch (error) {
-      this.message(error instanceof Error ? error.message : String(error));
+      this.message(messageOf(error));
     }
   }
 
   /** @param {boolean} orbit whether to rotate about the scene; otherwise about the eye */
   setMode(orbit) {
-    if (this.controls) this.controls.orbit = orbit;
+    if (this.controls) this.controls.motion.orbit = orbit;
     this.setHelp();
   }
 
   /** Show the keys of the mode, and those of another part. @param {string[][]} [others] */
   setHelp(others = []) {
-    const mode = this.controls?.orbit === false ? say.flyHelp : say.orbitHelp;
+    const mode = this.controls?.motion.orbit === false ? say.flyHelp : say.orbitHelp;
     put(this.helpList, [...mode, ...others, ...say.help].map(([keys, what]) => h("div", h("dt", keys), h("dd", what))));
   }
 
@@ -145,8 +145,7 @@ export class Stage {
 
   /** @param {string} text */
   message(text) {
-    this.note.hidden = !text;
-    if (this.note.textContent !== text) this.note.textContent = text;
+    tell(this.note, text);
   }
 
   /** @param {Side} left @param {Side} [right] @param {[string, string]} [names] */

@@ -4,7 +4,7 @@ import { artifactPath, ask, get } from "./api.js";
 import { h, put } from "./dom.js";
 import { nameOf, paintingsOf } from "./names.js";
 import { strengthName } from "./options.js";
-import { forgetUnfinished, unfinished } from "./uploads.js";
+import { forgetUnfinished, store, stored, unfinished } from "./uploads.js";
 import { percent, size, words } from "./words.js";
 
 /** @typedef {File | StoredFile} Chosen file of a form: on this device, or on the service */
@@ -90,32 +90,23 @@ let kept = null;
 /** @param {Draft} draft */
 export function keepDraft(draft) {
   kept = draft;
-  const parts = (/** @type {boolean} */ stored) => Object.entries(draft.files).map(([role, all]) => /** @type {const} */ ([role, all.filter((file) => file instanceof StoredFile === stored)]));
+  const parts = (/** @type {boolean} */ there) => Object.entries(draft.files).map(([role, all]) => /** @type {const} */ ([role, all.filter((file) => file instanceof StoredFile === there)]));
   const files = Object.fromEntries(parts(true)), lost = Object.fromEntries(parts(false).map(([role, all]) => [role, [...all.map(({ name }) => name), ...(draft.lost?.[role] ?? [])]]));
   const regions = draft.regions.map(({ mask, select, ...region }) => ({ ...region, ...(mask && !(mask.file instanceof StoredFile) ? {} : { select }) }));
-  try {
-    sessionStorage.setItem(STORED, JSON.stringify({ ...draft, files, lost, regions }));
-  } catch {
-    // private windows may have no storage
-  }
+  store("sessionStorage", STORED, { ...draft, files, lost, regions });
 }
 
 /** @returns {Draft | null} */
 export function keptDraft() {
   if (kept) return kept;
-  try {
-    const draft = JSON.parse(sessionStorage.getItem(STORED) ?? "null");
-    for (const files of Object.values(draft?.files ?? {})) files.forEach((/** @type {any} */ file, /** @type {number} */ i) => (files[i] = new StoredFile(file.path, file)));
-    return draft;
-  } catch {
-    return null;
-  }
+  const draft = stored("sessionStorage", STORED), files = Object.entries(draft?.files ?? {});
+  return draft && { ...draft, files: Object.fromEntries(files.map(([role, all]) => [role, all.map((/** @type {any} */ file) => new StoredFile(file.path, file))])) };
 }
 
 /** Forget everything that was entered into the form. */
 export function forgetDraft() {
   kept = null;
-  sessionStorage.removeItem(STORED);
+  store("sessionStorage", STORED, null);
 }
 
 /**
@@ -146,22 +137,10 @@ export async function startFrom(job, { painting = true } = {}) {
 const BASE = "sgsst.base.";
 
 /** Remember on whose result a job has painted. @param {string} id @param {string} base */
-export function keepBase(id, base) {
-  try {
-    sessionStorage.setItem(BASE + id, base);
-  } catch {
-    // private windows may have no storage
-  }
-}
+export const keepBase = (id, base) => store("sessionStorage", BASE + id, base);
 
 /** Return the id of the job on whose result a job has painted, if this tab has created it. @param {string} id @returns {string | null} */
-export function baseOf(id) {
-  try {
-    return sessionStorage.getItem(BASE + id);
-  } catch {
-    return null;
-  }
-}
+export const baseOf = (id) => stored("sessionStorage", BASE + id);
 
 const say = words.submit;
 

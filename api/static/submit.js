@@ -1,7 +1,7 @@
 // @ts-check
 /** View for a new job: it joins the parts of the form, keeps a draft of it, and shows refusals beside their inputs. */
 import { Problem } from "./api.js";
-import { announce, h, icon, put } from "./dom.js";
+import { announce, h, icon, put, tell } from "./dom.js";
 import { CropPanel } from "./crop_panel.js";
 import { forgetDraft, keepDraft, keptDraft, UnfinishedNotice } from "./stored.js";
 import { camerasProblem, imageProblem, listenToDrops, oneModel, Slot, sorted } from "./slots.js";
@@ -15,12 +15,11 @@ import { PaintPanel } from "./paint_panel.js";
 import { Refusals } from "./refusals.js";
 import { RegionList } from "./regions.js";
 import { accepted } from "./tables.js";
-import { ScenePart } from "./scene_part.js";
 import { SelectPanel } from "./select_panel.js";
 import { Stage } from "./stage.js";
 import { Submission } from "./submission.js";
 import { upQuestion } from "./upright.js";
-import { ViewsPart } from "./views_part.js";
+import { ScenePart, ViewsPart } from "./views_part.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./stored.js").Chosen} Chosen */
@@ -63,7 +62,7 @@ export class SubmitView {
       created: (job) => this.enter([job]),
     }, this.leaving.signal);
     this.example = new ExamplePart(() => this.startExample());
-    this.paintings = new PaintingsPart(this.slots.style, this.regions, () => this.styleChanged(), this.leaving.signal, this.example.offers[1]);
+    this.paintings = new PaintingsPart(this.slots.style, this.regions, () => this.styleChanged());
     this.views = new ViewsPart(this.slots, this.stage, this.options, this.crop, () => this.refresh());
     this.scene = new ScenePart(this.slots.scene, this.stage, { loaded: () => this.views.showCameras(), reload: () => this.sceneChanged() });
     this.submission = new Submission(this.leaving.signal);
@@ -77,7 +76,7 @@ export class SubmitView {
   build() {
     const { options, slots, submission } = this;
     this.invite = h("label.invite", { htmlFor: slots.scene.input.id }, h("span.plus", icon("plus")), h("strong.pointer", say.drop), h("strong.touch", say.dropTouch), h("span", say.dropMore));
-    this.stage.overlay.append(this.invite, this.example.offers[0]);
+    this.stage.overlay.append(this.invite, this.example.element);
     this.regionFold = h("details.fold", h("summary", say.regions), h("p.help", say.regionsHint), this.regions.element);
     this.paint.button.hidden = true;
     this.costButton = h("button.quiet", { type: "button", onclick: () => this.act(true) }, say.cost);
@@ -89,7 +88,7 @@ export class SubmitView {
       h("section", h("h2", say.files), this.unused, slots.scene.element, this.paintings.elements),
       this.views.element,
       h("section", h("h2", say.essentials), options.presets, options.main),
-      h("section", h("h2", say.more), options.search, options.none, h("div", options.lookFold, this.regionFold, options.expertFold)),
+      h("section", h("h2", say.more), h("div", options.lookFold, this.regionFold, options.expertFold)),
       h("div.actions", this.refusals.element, submission.card.element, h("div.row", this.costButton, this.startButton)), this.result);
     this.element = h("div.split", h("div.pinned", this.stage.element), this.form);
     this.views.show();
@@ -118,10 +117,7 @@ export class SubmitView {
       if (draft.orbiting) this.views.restore();
     } else options.useBudget();
     this.views.show();
-    this.form.addEventListener("input", (/** @type {Event} */ event) => {
-      this.saveDraft();
-      if (!options.presets.contains(event.target)) options.forgetTimes();
-    });
+    this.form.addEventListener("input", () => this.saveDraft());
   }
 
   /** Let the user select the Gaussians of a region. @param {import("./regions.js").Row} row */
@@ -151,8 +147,7 @@ export class SubmitView {
     const found = sorted(files);
     for (const role of /** @type {const} */ (["cameras", "photos", "style", "scene"])) this.slots[role].add(found[role]);
     const names = found.unknown.map(({ name }) => name);
-    this.unused.hidden = !names.length;
-    this.unused.textContent = names.length ? say.unused(names) : "";
+    tell(this.unused, names.length ? say.unused(names) : "");
   }
 
   sceneChanged() {
@@ -165,7 +160,7 @@ export class SubmitView {
     if (file !== this.shown) this.regions.dropMasks();
     this.shown = file;
     if (file && this.earlier && file.name !== this.earlier) this.leaveEarlier();
-    for (const offer of [this.invite, ...this.example.offers]) offer.hidden = !!file;
+    for (const offer of [this.invite, this.example.element]) offer.hidden = !!file;
     this.crop.button.hidden = !file;
     this.scene.show();
     if (file) this.views.show();
@@ -212,7 +207,6 @@ export class SubmitView {
   /** Discard the displayed plan, which was made for other files or parameters. */
   refresh() {
     if (!this.busy) put(this.result);
-    this.options.forgetTimes();
     const scene = this.slots.scene.files[0]?.name;
     this.name.suggest(defaultName(scene, this.paintings.own.map(({ name }) => name)));
     this.stage.title = this.name.value() ?? defaultName(scene, []);
@@ -250,7 +244,6 @@ export class SubmitView {
     this.clearWrong();
     this.markWrong();
     if (this.refusals.reveal()) return;
-    this.options.forgetTimes();
     const planning = !!this.busy;
     this.setBusy(dry ? "planning" : "starting");
     if (planning) this.submission.stopPlanning();
@@ -266,7 +259,7 @@ export class SubmitView {
     try {
       if (dry) {
         const [body] = await bodies();
-        this.showPlan(body, await this.submission.plan(body));
+        this.showPlan(await this.submission.plan(body));
       }
       if (this.busy === "starting") this.enter(await this.submission.create(await bodies()));
     } catch (error) {
@@ -299,12 +292,11 @@ export class SubmitView {
     if (busy) put(this.result);
   }
 
-  /** @param {any} body @param {any} plan */
-  showPlan(body, plan) {
+  /** @param {any} plan */
+  showPlan(plan) {
     if (!plan || this.busy === "starting") return;
     const { jobs } = this.paintings;
     if (plan.up) this.views.showPlanned(plan.up.direction, plan.views);
-    this.options.showTimes(body, plan);
     if (plan.up?.sure === false) return this.askUp(plan.up.candidates, true);
     put(this.result, costCard(plan, this.options.controls.has("within") ? () => (this.options.useBudget(), this.act(true)) : null), jobs > 1 ? h("p.help", say.eachTakes(jobs)) : null);
     this.result.scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
@@ -349,7 +341,6 @@ export class SubmitView {
   end() {
     this.saveDraft();
     this.leaving.abort();
-    this.options.forgetTimes();
     for (const part of [this.selecting, this.submission, ...Object.values(this.slots), this.stage, this.scene]) part.end();
   }
 }

@@ -17,25 +17,34 @@ const SAMPLES = 64, SAMPLE = 4096;
 /** @typedef {"waiting" | "sending" | "paused" | "offline" | "done"} State */
 /** @typedef {{id: string, name: string, size: number, sent: number}} Kept */
 
-/** @returns {Record<string, Kept>} */
-function kept() {
+/** @typedef {"localStorage" | "sessionStorage"} Place `sessionStorage` is that of this tab */
+
+/** Return a stored value; null if there is none, or if the browser stores nothing. @param {Place} place @param {string} name */
+export function stored(place, name) {
   try {
-    return JSON.parse(localStorage.getItem(KEPT) ?? "{}");
+    return JSON.parse(window[place].getItem(name) ?? "null");
   } catch {
-    return {};
+    return null;
   }
 }
 
+/** Store a value, unless the browser stores nothing or has no space. @param {Place} place @param {string} name @param {any} value null to forget it */
+export function store(place, name, value) {
+  try {
+    if (value === null) window[place].removeItem(name);
+    else window[place].setItem(name, JSON.stringify(value));
+  } catch {
+    // what is stored is a convenience
+  }
+}
+
+/** @returns {Record<string, Kept>} */
+const kept = () => stored("localStorage", KEPT) ?? {};
+
 /** @param {string} print @param {Kept | null} upload null to forget it */
 function keep(print, upload) {
-  const all = kept();
-  delete all[print];
-  if (upload) all[print] = upload;
-  try {
-    localStorage.setItem(KEPT, JSON.stringify(Object.fromEntries(Object.entries(all).slice(-MOST_KEPT))));
-  } catch {
-    // without storage, an upload restarts after a reload
-  }
+  const { [print]: _, ...others } = kept(), all = Object.entries(upload ? { ...others, [print]: upload } : others);
+  store("localStorage", KEPT, Object.fromEntries(all.slice(-MOST_KEPT)));
 }
 
 /** Return uploads that were started and not finished, with the modification times of their files. */

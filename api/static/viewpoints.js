@@ -1,7 +1,7 @@
 // @ts-check
 /** Viewpoints of a result: a list of buttons, a path through them, and for the maker of the result, their choice. */
 import { ask } from "./api.js";
-import { announce, h, icon, put } from "./dom.js";
+import { announce, h, icon, messageOf, put } from "./dom.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./cameras.js").JobCamera} JobCamera */
@@ -81,7 +81,7 @@ export class ViewpointsPanel {
       this.note.textContent = done;
       return true;
     } catch (error) {
-      this.note.textContent = error instanceof Error ? error.message : String(error);
+      this.note.textContent = messageOf(error);
       return false;
     } finally {
       this.form.inert = this.list.inert = false;

@@ -1,12 +1,13 @@
 // @ts-check
-/** Views of a new job: those of camera files, or an orbit around the scene, shown in the 3D view. */
+/** Scene of a new job, shown in the 3D view or refused, and its views: those of camera files, or an orbit around it. */
 import { readCameras, ringCameras } from "./cameras.js";
 import { h, put } from "./dom.js";
-import { contentOf } from "./stored.js";
+import { contentOf, StoredFile } from "./stored.js";
 import { directionOf, uprightButtons, UPS } from "./upright.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./slots.js").Slot} Slot */
+/** @typedef {import("./stage.js").Stage} Stage */
 /** @typedef {import("./cameras.js").JobCamera} JobCamera */
 
 const say = words.submit;
@@ -20,7 +21,7 @@ export function choice(group, name, checked, changed) {
 export class ViewsPart {
   /**
    * @param {Record<"scene" | "cameras" | "photos", Slot>} slots
-   * @param {import("./stage.js").Stage} stage
+   * @param {Stage} stage
    * @param {import("./options_part.js").OptionsPart} options
    * @param {import("./crop_panel.js").CropPanel} crop
    * @param {() => void} changed called after the views have changed
@@ -131,5 +132,58 @@ export class ViewsPart {
   restore() {
     this.around.input.checked = true;
     this.chosen = this.slots.cameras.files.length > 0;
+  }
+}
+
+export class ScenePart {
+  /**
+   * @param {Slot} slot
+   * @param {Stage} stage
+   * @param {{loaded: () => void, reload: () => void}} how `loaded` is called once the scene is shown, `reload` if the
+   *   graphics card has lost it
+   */
+  constructor(slot, stage, { loaded, reload }) {
+    this.slot = slot;
+    this.stage = stage;
+    this.loaded = loaded;
+    this.reload = reload;
+    /** @type {import("./viewer/splat_scene.js").SplatScene | null} */
+    this.opened = null;
+  }
+
+  /** Show the scene of the slot, or nothing. */
+  async show() {
+    const [file] = this.slot.files, { viewer } = this.stage;
+    this.opened?.end();
+    this.opened = null;
+    if (!viewer) return;
+    viewer.touched = false;
+    viewer.sides = null;
+    if (!file) {
+      this.stage.bar.hidden = true;
+      this.stage.message("");
+      return viewer.draw();
+    }
+    const scene = (this.opened = viewer.open(file instanceof StoredFile ? file.url : file));
+    viewer.onReload = () => this.reload();
+    this.stage.show({ scene, colors: "own" });
+    try {
+      const header = await scene.headerRead;
+      this.slot.say(words.scene.header(header));
+      await scene.ready;
+      this.loaded();
+    } catch (error) {
+      if (this.opened !== scene) return;
+      this.stage.bar.hidden = true;
+      viewer.sides = null;
+      viewer.draw();
+      const { message, cut } = /** @type {import("./viewer/splat_scene.js").SceneFailure} */ (error);
+      this.stage.message(message);
+      if (cut || message === words.scene.notScene) this.slot.fail(message);
+    }
+  }
+
+  end() {
+    if (this.stage.viewer) this.opened?.end(); // else another stage shows it
   }
 }

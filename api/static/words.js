@@ -100,10 +100,10 @@ export const words = {
     unused: (/** @type {string[]} */ names) => `Not used: ${names.slice(0, 5).join(", ")}${names.length > 5 ? ` and ${number.format(names.length - 5)} more` : ""}. Add one scene (${sceneTitles}), images and camera files (JSON, BIN or TXT).`,
     drop: "Drop your scene here", dropTouch: "Tap to choose a scene", dropMore: "You can add cameras and a painting too.", dropNow: "Drop to add files",
     files: "Files", views: "Views", fromFiles: "Use my cameras", around: "Orbit the object", foreign: "Are these the scene's cameras?", anyway: "Start anyway", howMany: "Number of views", preset: "Preset", essentials: "Essentials", lookOptions: "Look", expertOptions: "Expert", expertHint: "Settings of the method. The preset's values suit most scenes.", weights: "Blend",
-    nFiles: (/** @type {number} */ n) => several(n, "file"), more: "More options", find: "Find an option", regions: "Regions", addRegion: "Add a region", noOptions: "No matching option.", optionsAway: "Couldn't load the options; the preset's defaults apply.",
+    nFiles: (/** @type {number} */ n) => several(n, "file"), more: "More options", regions: "Regions", addRegion: "Add a region", optionsAway: "Couldn't load the options; the preset's defaults apply.",
     regionsHint: "Give parts of the scene their own painting, or freeze them.", region: (/** @type {number} */ n) => `Region ${n}`, part: (/** @type {number} */ n) => `Part ${n}`, paintingOf: (/** @type {string[]} */ names) => `for ${names.join(", ")}`, regionName: "Name", regionSelect: "Select", regionStrength: "Strength", freeze: "Freeze", ownStyle: "Same as the job",
     presets: /** @type {Record<string, string>} */ ({ preview: "Quick look, minutes", standard: "Recommended", paper: "Published settings, hours" }),
-    about: (/** @type {string} */ time) => `about ${time}`, cost: "Estimate time", start: "Start", starting: "Starting…", planning: "Analyzing views…", planned: (/** @type {number} */ step, /** @type {number} */ total) => `${count(step)} of ${several(total, "view")} analyzed`,
+    cost: "Estimate time", start: "Start", starting: "Starting…", planning: "Analyzing views…", planned: (/** @type {number} */ step, /** @type {number} */ total) => `${count(step)} of ${several(total, "view")} analyzed`,
     needScene: "Choose a scene.", needStyle: "Choose a painting.", needOwnStyle: "Choose a painting for the rest of the scene.", needSelection: "Select a part of the scene in the 3D view, or remove the region.", needName: "Give the region a name.", needCameras: "Choose camera files, or orbit the object.", noCameras: "No cameras were given, so the views orbit the object. If it doesn't stand upright, turn it with the buttons below the 3D view.",
     resumable: (/** @type {string} */ name, /** @type {string} */ size, /** @type {string} */ share) => `“${name}” (${size}) was ${share} uploaded. Choose it again to finish.`,
     resumed: (/** @type {string} */ name, /** @type {string} */ share) => `“${name}” is ${share} uploaded. Only the rest will be sent.`, forget: "Discard",
@@ -129,7 +129,7 @@ export const words = {
     toolHelp: { move: "Drag to move the camera.", brush: "Paint over the scene. Hold Alt to do the opposite; drag with the right button to move the camera.", lasso: "Draw around a part of the scene.", box: "Drag the handles or enter numbers, then apply.", sphere: "Drag the handles or enter numbers, then apply.", similar: "Click a color; then change the tolerance." },
     radius: "Brush size", tolerance: "Tolerance", through: "Select through", connected: "Connected only", atMiddle: "Pick at the middle", apply: "Apply",
     moveShape: "Move", resize: (/** @type {string} */ axis, /** @type {number} */ sign) => `Resize ${sign > 0 ? "+" : "−"}${axis}`, center: ["X", "Y", "Z"], sizes: ["Half width", "Half height", "Half depth"], sphereRadius: "Radius",
-    undo: "Undo", redo: "Redo", invert: "Invert", grow: "Grow", clear: "Clear", cancel: "Cancel", done: "Use selection",
+    undo: "Undo", redo: "Redo", invert: "Invert", clear: "Clear", cancel: "Cancel", done: "Use selection",
   },
   upright: {
     turn: "Turn the scene by 90°", tip: "Tip the scene by 90°, toward you", which: "Which way is up?", unsure: "The scene doesn't show it, and the views orbit the object upright. Choose the image that stands upright.",
@@ -205,7 +205,7 @@ export const words = {
     early: /** @type {Record<string, string>} */ ({ within: "Its time was used up", "on-request": "This job was stopped early", converged: "The loss no longer fell", "target-loss": "The target loss was reached" }),
     onward: /** @type {Record<string, string>} */ ({ within: "For the other steps, choose “Continue”; for a finer result, “Same with changes” with more time.", "on-request": "For all steps, choose “Continue”." }),
     risen: "The loss has risen: choose “Same with changes” and give it more steps.",
-    threeD: "3D", sheet: "Before and after", result: "Result", download: "Download", format: "Format", converting: "Converted on the first download, which takes about 10 seconds for a million Gaussians.", files: "Files", settings: "Settings", inputs: "Inputs", openReport: "Open the report", noFiles: "Nothing yet.", noScene: "This scene can't be shown here.", view3d: "Result", compare: "Compare with", compareWith: "Another job of this scene",
+    threeD: "3D", sheet: "Before and after", result: "Result", download: "Download", format: "Format", converting: "Converted on the first download, which takes about 10 seconds for a million Gaussians.", files: "Files", settings: "Settings", inputs: "Inputs", openReport: "Open the report", noFiles: "Nothing yet.", noScene: "This scene can't be shown here.", view3d: "Result",
     sheetOf: (/** @type {string} */ name) => `Views of ${name} before and after`, failed: "The job failed", anotherPainting: "Try another painting", changed: "Same with changes",
   },
   video: {
@@ -223,7 +223,7 @@ export const words = {
   },
   compare: { title: "Compare", heading: (/** @type {string} */ a, /** @type {string} */ b) => `${a} and ${b}`, several: (/** @type {number} */ n) => `${n} paintings of one scene`, notThere: "One of these jobs is missing or unfinished.", sheet: "Jobs side by side" },
   gallery: {
-    title: "Gallery", used: "Recently used", bundled: "Public-domain paintings", use: (/** @type {string} */ title) => `Add ${title}`,
+    title: "Gallery", bundled: "Public-domain paintings", use: (/** @type {string} */ title) => `Add ${title}`,
     paintings: /** @type {Record<string, string>} */ ({
       starry_night: "The Starry Night, Vincent van Gogh", wheat_field_with_cypresses: "Wheat Field with Cypresses, Vincent van Gogh", great_wave: "The Great Wave off Kanagawa, Hokusai",
       shipwreck: "The Wreck of a Transport Ship, Turner", rembrandt_old_man: "Old Man, Rembrandt", vallotton_woodcut: "Woodcut, Félix Vallotton",

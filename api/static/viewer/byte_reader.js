@@ -3,7 +3,11 @@
 import { words } from "../words.js";
 
 /** Error of a file that cannot be shown; its message is shown to the user. */
-export class SceneError extends Error {}
+export class SceneError extends Error {
+  constructor(message = words.scene.unreadable) {
+    super(message);
+  }
+}
 
 /** Error of a file that ends too early. */
 export class CutError extends SceneError {}
@@ -44,14 +48,11 @@ export class ByteReader {
   async take(count) {
     const found = new Uint8Array(count);
     for (let filled = 0; filled < count;) {
-      if (!this.rest.length) {
-        const { value, done } = await this.reader.read();
-        if (done) throw new CutError(words.scene.cut);
-        this.rest = value;
-      }
-      const part = this.rest.subarray(0, count - filled);
+      const some = await this.some();
+      if (!some) throw new CutError(words.scene.cut);
+      const part = some.subarray(0, count - filled);
       found.set(part, filled);
-      this.rest = this.rest.subarray(part.length);
+      this.rest = some.subarray(part.length);
       filled += part.length;
     }
     return found;
@@ -66,12 +67,9 @@ export class ByteReader {
 
   /** Take all remaining bytes. @returns {Promise<Uint8Array<ArrayBuffer>>} */
   async all() {
-    const parts = [this.rest];
-    for (;;) {
-      const { value, done } = await this.reader.read();
-      if (done) return new Uint8Array(await new Blob(/** @type {BlobPart[]} */ (parts)).arrayBuffer());
-      parts.push(value);
-    }
+    const parts = [];
+    for (let part = await this.some(); part; part = await this.some()) parts.push(part);
+    return new Uint8Array(await new Blob(/** @type {BlobPart[]} */ (parts)).arrayBuffer());
   }
 
   /**
@@ -81,15 +79,13 @@ export class ByteReader {
    * @returns {ByteReader}
    */
   piped(through) {
-    const { reader, rest } = this;
     const all = new ReadableStream({
-      start: (out) => out.enqueue(rest),
       pull: async (out) => {
-        const { value, done } = await reader.read();
-        if (done) out.close();
-        else out.enqueue(value);
+        const part = await this.some();
+        if (part) out.enqueue(part);
+        else out.close();
       },
-      cancel: (why) => reader.cancel(why),
+      cancel: () => this.end(),
     });
     return new ByteReader(all.pipeThrough(through));
   }
@@ -158,7 +154,7 @@ export async function unzipped(data) {
     files.set(new TextDecoder().decode(data.subarray(at + ENTRY_BYTES, at + ENTRY_BYTES + name)), async () => {
       const begin = local + 30 + view.getUint16(local + 26, true) + view.getUint16(local + 28, true), packed = data.subarray(begin, begin + bytes);
       if (method === STORED) return packed;
-      if (method !== DEFLATED) throw new SceneError(words.scene.unreadable);
+      if (method !== DEFLATED) throw new SceneError();
       return new Uint8Array(await new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate-raw"))).arrayBuffer());
     });
     at += ENTRY_BYTES + name + extra + comment;

@@ -23,13 +23,12 @@ export class ViewCamera {
     this.up = [0, -1, 0];
     /** Step of a movement in world units. */
     this.size = 1;
-    /**
-     * Focal lengths as multiples of the frame's height, and the frame's aspect ratio; 0 for the aspect ratio of the
-     * canvas.
-     */
+    /** Focal lengths as multiples of the frame's height, and its aspect ratio; 0 for that of the canvas. */
     this.focal = [FOCAL, FOCAL];
     this.shape = 0;
     this.near = 0.2;
+    /** Returns the principal point in pixels from the middle of a canvas. @type {(width: number, height: number) => number[]} */
+    this.shift = () => [0, 0];
     /** Number of the last change. */
     this.number = 0;
   }
@@ -122,16 +121,6 @@ export class ViewCamera {
   }
 
   /**
-   * Return the principal point in pixels from the middle of a canvas: it is there.
-   *
-   * @param {number} _width
-   * @param {number} _height
-   */
-  shift(_width, _height) {
-    return [0, 0];
-  }
-
-  /**
    * @param {number} aside radians to the right, as if dragging the scene
    * @param {number} over radians; positive looks further down
    * @param {boolean} about whether to rotate about the target; otherwise about the eye
@@ -152,9 +141,9 @@ export class ViewCamera {
 
   /** @param {number} factor factor of the distance to the target */
   approach(factor) {
-    const away = difference(this.eye, this.target);
-    if (Math.hypot(...away) * factor < 1e-3 * this.size || Math.hypot(...away) * factor > 1e3 * this.size) return;
-    this.eye = sum(this.target, times(away, factor));
+    const distance = this.distance * factor;
+    if (distance < 1e-3 * this.size || distance > 1e3 * this.size) return;
+    this.eye = sum(this.target, times(difference(this.eye, this.target), factor));
     this.number++;
   }
 

@@ -10,11 +10,6 @@ import { difference, sum, times } from "./vectors.js";
 /** @typedef {import("../cameras.js").JobCamera} JobCamera */
 /** @typedef {{moved?: () => void, toggle?: () => void, camera?: (by: number) => void, viewpoint?: (index: number) => void, home?: () => void, hold?: (held: boolean) => void}} Actions `moved` is called when the camera leaves its place, `hold` when O is pressed and released */
 
-/** Milliseconds after the last movement of a pointer during which its release lets the scene glide. */
-const THROWN = 60;
-/** Fraction of the newest movement in the speed of a pointer. */
-const NEWEST = 0.4;
-
 export class Controls {
   /** Actions of other keys. @type {Actions} */
   keys = {};
@@ -25,14 +20,12 @@ export class Controls {
     this.motion = new Motion(viewer);
     /** @type {Map<number, {x: number, y: number}>} */
     this.hands = new Map();
-    /** Speed of the last drag in CSS pixels per millisecond, and its time. */
-    this.thrown = { x: 0, y: 0, at: 0, pans: false };
     /** Last position of the pointer, in the window. @type {{x: number, y: number} | null} */
     this.pointer = null;
     const { canvas } = viewer;
     canvas.addEventListener("pointerdown", (event) => this.down(event));
     canvas.addEventListener("pointermove", (event) => this.move(event));
-    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => this.up(/** @type {PointerEvent} */ (event)));
+    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => this.hands.delete(/** @type {PointerEvent} */ (event).pointerId));
     canvas.addEventListener("pointerleave", () => (this.pointer = null));
     canvas.addEventListener("dblclick", (event) => this.focus(event.clientX, event.clientY));
     canvas.addEventListener("mousedown", (event) => event.button === 1 && event.preventDefault()); // no automatic scrolling
@@ -43,22 +36,12 @@ export class Controls {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   }
 
-  /** Whether to rotate about the scene; otherwise about the eye. */
-  get orbit() {
-    return this.motion.orbit;
-  }
-
-  set orbit(orbit) {
-    this.motion.orbit = orbit;
-  }
-
   /** @param {PointerEvent} event */
   down(event) {
     this.motion.stop();
     this.keys.moved?.();
     this.viewer.canvas.setPointerCapture(event.pointerId);
     this.hands.set(event.pointerId, { x: event.clientX, y: event.clientY });
-    this.thrown = { x: 0, y: 0, at: 0, pans: false };
   }
 
   /** @param {PointerEvent} event */
@@ -69,51 +52,12 @@ export class Controls {
     const now = this.pointer, dx = now.x - before.x, dy = now.y - before.y;
     const others = [...this.hands].filter(([id]) => id !== event.pointerId).map(([, place]) => place);
     this.hands.set(event.pointerId, now);
-    const pans = Boolean(event.buttons & 6) || event.shiftKey;
-    if (others.length) this.pinch(before, now, others[0], dx, dy);
-    else this.motion.drag(dx, dy, pans);
-    this.track(dx, dy, others.length ? NaN : event.timeStamp, pans);
+    if (others.length) { // the distance of two fingers zooms, their midpoint pans
+      const [was, is] = [before, now].map(({ x, y }) => Math.hypot(x - others[0].x, y - others[0].y));
+      if (was > 1 && is > 1) this.motion.approach(was / is);
+      this.motion.drag(dx / 2, dy / 2, true);
+    } else this.motion.drag(dx, dy, Boolean(event.buttons & 6) || event.shiftKey);
     this.viewer.moved();
-  }
-
-  /**
-   * Follow the speed of a drag.
-   *
-   * @param {number} dx CSS pixels
-   * @param {number} dy
-   * @param {number} at milliseconds; NaN with two fingers, which do not glide
-   * @param {boolean} pans
-   */
-  track(dx, dy, at, pans) {
-    const { thrown } = this, elapsed = Math.max(1, at - thrown.at);
-    if (thrown.at && elapsed < THROWN) {
-      thrown.x += NEWEST * (dx / elapsed - thrown.x);
-      thrown.y += NEWEST * (dy / elapsed - thrown.y);
-    } else [thrown.x, thrown.y] = [0, 0];
-    [thrown.at, thrown.pans] = [at || 0, pans];
-  }
-
-  /** @param {PointerEvent} event */
-  up(event) {
-    const { thrown } = this;
-    if (this.hands.delete(event.pointerId) && event.type === "pointerup" && event.timeStamp - thrown.at < THROWN) {
-      this.motion.glide(thrown.x, thrown.y, thrown.pans);
-    }
-  }
-
-  /**
-   * Handle two fingers: their distance zooms, their midpoint pans.
-   *
-   * @param {{x: number, y: number}} before
-   * @param {{x: number, y: number}} now
-   * @param {{x: number, y: number}} other
-   * @param {number} dx
-   * @param {number} dy
-   */
-  pinch(before, now, other, dx, dy) {
-    const was = Math.hypot(before.x - other.x, before.y - other.y), is = Math.hypot(now.x - other.x, now.y - other.y);
-    if (was > 1 && is > 1) this.motion.approach(was / is);
-    this.motion.drag(dx / 2, dy / 2, true);
   }
 
   /** @param {WheelEvent} event */
@@ -135,7 +79,7 @@ export class Controls {
 
   /** @param {KeyboardEvent} event */
   key(event) {
-    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, moves = this.motion.moves(key);
+    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, moves = key in TURNS || key in STEPS;
     if (key === "Shift" || key === "Control") return this.motion.hurry(event.shiftKey, event.ctrlKey);
     if ((event.ctrlKey || event.metaKey || event.altKey) && !this.motion.held.has(key)) return; // a shortcut of the browser
     if (moves) {
@@ -148,24 +92,23 @@ export class Controls {
     } else if (key === " ") this.keys.toggle?.();
     else if (key === "o") event.repeat || this.keys.hold?.(true);
     else if (key === "Home") this.keys.home?.();
-    else if (key === "f") this.focusPointer();
+    else if (key === "f") this.focus(...this.aim());
     else if (key === "," || key === ".") this.keys.camera?.(key === "," ? -1 : 1);
     else if (/^[1-9]$/.test(key)) this.keys.viewpoint?.(Number(key) - 1);
     else return;
     event.preventDefault();
   }
 
-  /** Focus what is under the pointer, or in the middle. */
-  focusPointer() {
+  /** Return the position of the pointer, or else of the middle. @returns {[number, number]} */
+  aim() {
     const { left, top, width, height } = this.viewer.canvas.getBoundingClientRect();
-    const { x, y } = this.pointer ?? { x: left + width / 2, y: top + height / 2 };
-    this.focus(x, y);
+    return this.pointer ? [this.pointer.x, this.pointer.y] : [left + width / 2, top + height / 2];
   }
 
   /** @param {KeyboardEvent} event */
   released(event) {
     this.motion.hurry(event.shiftKey, event.ctrlKey);
-    this.motion.release(event.key.length === 1 ? event.key.toLowerCase() : event.key);
+    this.motion.held.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key);
     if (event.key.toLowerCase() === "o") this.keys.hold?.(false);
   }
 
@@ -187,8 +130,6 @@ const STEPS = { a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0], w: [0,
 const TURN_SPEED = 1.5, SPIN_SPEED = 0.2, STEP_SPEED = 0.8, FAST = 4, SLOW = 0.25;
 /** CSS pixels of a drag per radian. */
 const PIXELS_PER_RADIAN = 180;
-/** Milliseconds in which a glide loses two thirds of its speed, and speed in CSS pixels per millisecond where it ends. */
-const GLIDE = 130, END = 0.02;
 /** Milliseconds of a flight from one viewpoint to the next. */
 const FLIGHT = 1500;
 /** Milliseconds of turning to a point; shortest and longest time between frames, so that each press moves a little. */
@@ -203,8 +144,6 @@ export class Motion {
     /** @type {Set<string>} */
     this.held = new Set();
     this.factor = 1;
-    /** @type {{x: number, y: number, pans: boolean} | null} */
-    this.speed = null;
     /** @type {{from: Vector, to: Vector, left: number} | null} */
     this.turning = null;
     /** Flight through viewpoints: where its part starts and ends, and the viewpoints that follow. @type {{from: ViewCamera, to: ViewCamera, next: JobCamera[], left: number} | null} */
@@ -216,11 +155,6 @@ export class Motion {
   }
 
   /** @param {string} key */
-  moves(key) {
-    return key in TURNS || key in STEPS;
-  }
-
-  /** @param {string} key */
   press(key) {
     this.turning = this.flight = null;
     if (this.held.has(key)) return;
@@ -228,27 +162,9 @@ export class Motion {
     this.start();
   }
 
-  /** @param {string} key */
-  release(key) {
-    this.held.delete(key);
-  }
-
   /** @param {boolean} fast @param {boolean} slow */
   hurry(fast, slow) {
     this.factor = (fast ? FAST : 1) * (slow ? SLOW : 1);
-  }
-
-  /**
-   * Let the scene glide after a drag.
-   *
-   * @param {number} x CSS pixels per millisecond
-   * @param {number} y
-   * @param {boolean} pans
-   */
-  glide(x, y, pans) {
-    if (Math.hypot(x, y) < END || stillness()) return;
-    this.speed = { x, y, pans };
-    this.start();
   }
 
   /** @param {Vector} point */
@@ -286,7 +202,7 @@ export class Motion {
 
   stop() {
     this.held.clear();
-    this.speed = this.turning = this.flight = null;
+    this.turning = this.flight = null;
     this.spinning = false;
   }
 
@@ -301,7 +217,7 @@ export class Motion {
     this.requested = 0;
     const milliseconds = Math.min(MAX_FRAME, Math.max(MIN_FRAME, now - this.last));
     this.last = now;
-    if (this.viewer.ended || (!this.held.size && !this.speed && !this.turning && !this.flight && !this.spinning)) return;
+    if (this.viewer.ended || (!this.held.size && !this.turning && !this.flight && !this.spinning)) return;
     this.advance(milliseconds);
     this.viewer.moved();
     this.requested = requestAnimationFrame((next) => this.step(next));
@@ -309,18 +225,12 @@ export class Motion {
 
   /** @param {number} milliseconds */
   advance(milliseconds) {
-    const { camera } = this.viewer, { speed, turning, flight } = this, seconds = (milliseconds / 1000) * this.factor;
+    const { camera } = this.viewer, { turning, flight } = this, seconds = (milliseconds / 1000) * this.factor;
     for (const key of this.held) {
       if (TURNS[key]) camera.turn(TURNS[key][0] * TURN_SPEED * seconds, TURNS[key][1] * TURN_SPEED * seconds, this.orbit);
       else camera.move(times(STEPS[key], STEP_SPEED * camera.size * seconds));
     }
     if (this.spinning) camera.turn(SPIN_SPEED * seconds, 0, true);
-    if (speed) {
-      this.drag(speed.x * milliseconds, speed.y * milliseconds, speed.pans);
-      const rest = Math.exp(-milliseconds / GLIDE);
-      [speed.x, speed.y] = [speed.x * rest, speed.y * rest];
-      if (Math.hypot(speed.x, speed.y) < END) this.speed = null;
-    }
     if (flight) {
       flight.left = Math.max(0, flight.left - milliseconds);
       const even = 1 - flight.left / FLIGHT;

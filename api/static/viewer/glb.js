@@ -5,7 +5,7 @@
  * Nodes may move, rotate and evenly scale the Gaussians. Files with distorting nodes or sparse values are not shown.
  */
 import { SceneError } from "./byte_reader.js";
-import { cross, dot, rotatedHarmonics, times, unit } from "./vectors.js";
+import { cross, dot, rotatedHarmonics, times, turnOf, unit } from "./vectors.js";
 import { COLOR, HARMONICS, OPACITY, ROTATION, SCALES, unpacked } from "./packing.js";
 import { extrasRendering } from "./render_tag.js";
 import { words } from "../words.js";
@@ -29,7 +29,7 @@ const TOLERANCE = 1e-4;
 /** @param {ByteReader} reader @returns {Promise<SceneFile>} */
 export async function glb(reader) {
   const head = new DataView((await reader.take(20)).buffer), size = head.getUint32(12, true);
-  if (head.getUint32(4, true) !== 2 || size > MAX_JSON) throw new SceneError(words.scene.unreadable);
+  if (head.getUint32(4, true) !== 2 || size > MAX_JSON) throw new SceneError();
   const text = new TextDecoder().decode(await reader.take(size));
   const bytes = new DataView((await reader.take(8)).buffer).getUint32(0, true);
   const { parts, degree, rendering } = partsOf(text, bytes), coefficients = (degree + 1) ** 2 - 1;
@@ -59,15 +59,7 @@ export async function glb(reader) {
  * @param {number} bytes size of the data
  */
 function partsOf(text, bytes) {
-  try {
-    return partsIn(JSON.parse(text), bytes);
-  } catch (error) {
-    throw error instanceof SceneError ? error : new SceneError(words.scene.unreadable); // values are missing
-  }
-}
-
-/** @param {any} document @param {number} bytes */
-function partsIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
+  const { accessors, bufferViews, meshes, nodes = [] } = JSON.parse(text);
   const isSplats = (/** @type {any} */ each) => Boolean(each.extensions?.[EXTENSION]);
   /** @type {{primitives: any[], pose: Pose}[]} */
   const shown = nodes.flatMap((/** @type {any} */ node, /** @type {number} */ i) => {
@@ -106,13 +98,7 @@ function poseOf(nodes, index) {
 /** Return the rows of a node's own transformation, each with its part of the translation. @param {any} node */
 function rowsOf({ matrix, rotation = [0, 0, 0, 1], scale = [1, 1, 1], translation = [0, 0, 0] }) {
   if (matrix) return [0, 1, 2].map((row) => [0, 1, 2, 3].map((column) => matrix[4 * column + row]));
-  const [x, y, z, w] = unit(rotation);
-  const turned = [
-    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-  ];
-  return turned.map((row, i) => [...row.map((value, j) => value * scale[j]), translation[i]]);
+  return turnOf(unit(rotation)).map((row, i) => [...row.map((value, j) => value * scale[j]), translation[i]]);
 }
 
 /** Return the rows of a transformation that follows another one. @param {number[][]} last @param {number[][]} first */

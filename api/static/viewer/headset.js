@@ -163,7 +163,7 @@ export class Headset {
       const ray = pressed(TRIGGER) && rayOf(frame.getPose(targetRaySpace, this.space));
       if (ray) rays.set(handedness, ray);
       const before = this.rays.get(handedness);
-      if (before && !pressed(TRIGGER)) this.standAt(before.floor, head);
+      if (before && !pressed(TRIGGER)) this.placement.shift([head[0] - before.floor[0], 0, head[2] - before.floor[2]]);
     }
     this.rays = rays;
     const both = [...grips.keys()].filter((hand) => this.grips.has(hand));
@@ -180,12 +180,6 @@ export class Headset {
   walk(pose, x, y, seconds) {
     const m = pose.transform.matrix, flat = Math.hypot(m[8], m[10]) || 1, back = [m[8] / flat, 0, m[10] / flat], right = [back[2], 0, -back[0]];
     this.placement.shift(times(sum(times(right, x), times(back, y)), -WALK * seconds));
-  }
-
-  /** Stand at a point of the floor. @param {Vector} floor @param {Vector} head */
-  standAt(floor, head) {
-    const by = difference(head, floor);
-    this.placement.shift([by[0], 0, by[2]]);
   }
 
   /** Return the rays, with rings where they reach the floor, as pairs of points in the scene. */

@@ -6,16 +6,17 @@ import { lineFragment, lineVertex, overBackground, splatFragment, splatVertex, w
 /** @typedef {import("./viewer.js").Viewer} Viewer */
 /** @typedef {import("./viewer.js").Side} Side */
 /** @typedef {import("./splat_scene.js").SplatScene} SplatScene */
-/** @typedef {{program: WebGLProgram, at: (name: string) => WebGLUniformLocation | null}} Program */
+/** @typedef {(name: string) => WebGLUniformLocation | null} Locate returns where a uniform of a program is */
+/** @typedef {{program: WebGLProgram, at: Locate}} Program */
 
-/** Fraction of the highlight's color in highlighted Gaussians, and texture unit of the marks. */
-const HIGHLIGHT = 0.6, MARKS_UNIT = 10;
+/** Fraction of the highlight's color in highlighted Gaussians. */
+const HIGHLIGHT = 0.6;
 /** Color of lines, and their opacity. */
 const INK = [0.98, 0.6, 0.28, 0.55];
 
 export class Painter {
-  /** Programs by degree of harmonics and size of their textures. @type {Map<number, Program>} */
-  splatPrograms = new Map();
+  /** @type {Map<string, Program>} */
+  programs = new Map();
   /** Framebuffer for blending. @type {WebGLFramebuffer | null} */
   frame = null;
   /** @type {WebGLTexture | null} */
@@ -34,9 +35,7 @@ export class Painter {
     const { gl } = this;
     this.exact = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     gl.getExtension("OES_texture_float_linear");
-    this.splatPrograms = new Map();
-    this.compose = this.program(wholeVertex, overBackground);
-    this.line = this.program(lineVertex, lineFragment);
+    this.programs = new Map();
     this.corners = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.corners);
     gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
@@ -44,6 +43,19 @@ export class Painter {
     this.frame = gl.createFramebuffer();
     this.picture = null;
     this.pictureSize = [0, 0];
+  }
+
+  /**
+   * Use a program, which is made at its first use. Return how to find its uniforms.
+   *
+   * @param {string} name
+   * @param {() => [string, string]} shaders returns the sources of its vertex and its fragment shader
+   */
+  use(name, shaders) {
+    const { program, at } = this.programs.get(name) ?? this.program(...shaders());
+    this.programs.set(name, { program, at });
+    this.gl.useProgram(program);
+    return at;
   }
 
   /** @param {string} vertex @param {string} fragment @returns {Program} */
@@ -74,10 +86,6 @@ export class Painter {
     }
     const w = Math.ceil(width * this.viewer.scale), h = Math.ceil(height * this.viewer.scale);
     this.target(w, h);
-    gl.viewport(0, 0, w, h);
-    gl.disable(gl.SCISSOR_TEST);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT);
     if (this.viewer.sides) this.splats(this.viewer.sides, this.viewer.cut, [0, 0, w, h]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
@@ -98,10 +106,6 @@ export class Painter {
   renderEyes({ framebuffer, framebufferWidth, framebufferHeight }, eyes, sides, scale, lines, through) {
     const { gl } = this, own = this.viewer.camera, w = Math.ceil(framebufferWidth * scale), h = Math.ceil(framebufferHeight * scale);
     this.target(w, h);
-    gl.disable(gl.SCISSOR_TEST);
-    gl.viewport(0, 0, w, h);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT);
     for (const eye of eyes) {
       this.viewer.camera = eye;
       const part = eye.viewport.map((/** @type {number} */ value) => Math.floor(value * scale));
@@ -120,8 +124,8 @@ export class Painter {
   }
 
   /**
-   * Bind the framebuffer for blending, with a texture of this size. It has half precision if the browser supports that,
-   * because 8 bits would lose faint Gaussians.
+   * Bind and clear the framebuffer for blending, with a texture of this size. It has half precision if the browser
+   * supports that, because 8 bits would lose faint Gaussians.
    *
    * @param {number} width
    * @param {number} height
@@ -129,15 +133,19 @@ export class Painter {
   target(width, height) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
-    if (this.pictureSize[0] === width && this.pictureSize[1] === height) return;
-    gl.deleteTexture(this.picture);
-    this.picture = gl.createTexture();
-    this.pictureSize = [width, height];
-    gl.bindTexture(gl.TEXTURE_2D, this.picture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, this.exact ? gl.RGBA16F : gl.RGBA8, width, height);
-    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
-    for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.LINEAR);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
+    if (this.pictureSize[0] !== width || this.pictureSize[1] !== height) {
+      gl.deleteTexture(this.picture);
+      this.picture = gl.createTexture();
+      this.pictureSize = [width, height];
+      gl.bindTexture(gl.TEXTURE_2D, this.picture);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, this.exact ? gl.RGBA16F : gl.RGBA8, width, height);
+      for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+      for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.LINEAR);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
+    }
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
   }
 
   /**
@@ -172,18 +180,12 @@ export class Painter {
     const { gl } = this, { scene } = left;
     const own = scene.colors.get("own");
     if (!scene.drawn || !own) return;
-    const key = scene.degree * 100 + scene.bits;
-    const { program, at } = this.splatPrograms.get(key) ?? this.program(splatVertex(scene.degree, scene.bits), splatFragment);
-    this.splatPrograms.set(key, { program, at });
-    gl.useProgram(program);
-    this.setView(at, width, height);
-    this.setMarks(at, scene);
+    const at = this.use(`splats ${scene.degree} ${scene.bits}`, () => [splatVertex(scene.degree, scene.bits), splatFragment]);
+    this.setScene(at, scene, width, height);
     gl.uniform2f(at("fade"), 1 - (left.fade ?? 0), 1 - (right.fade ?? 0));
     gl.uniform1f(at("cut"), cut);
-    const { antialiased, eps2d } = scene.header?.rendering ?? CLASSIC;
-    gl.uniform1f(at("eps2d"), eps2d);
-    gl.uniform1i(at("antialiased"), Number(antialiased));
-    const textures = Object.entries({ geometry: scene.geometry, harmonics: scene.harmonics });
+    gl.uniform1f(at("highlight"), scene.marks ? HIGHLIGHT : 0);
+    const textures = Object.entries({ geometry: scene.geometry, harmonics: scene.harmonics, marks: scene.marks ?? scene.geometry });
     for (const [name, side] of /** @type {[string, Side][]} */ ([["left", left], ["right", right]])) {
       const parts = side.blend ?? [{ colors: side.colors, weight: 1 }];
       gl.uniform3fv(at(`${name}Weights`), [0, 1, 2].map((i) => parts[i]?.weight ?? 0));
@@ -196,20 +198,6 @@ export class Painter {
     });
     gl.activeTexture(gl.TEXTURE0 + textures.length);
     this.drawInstances(scene);
-  }
-
-  /**
-   * Set the Gaussians to highlight.
-   *
-   * @param {(name: string) => WebGLUniformLocation | null} at
-   * @param {SplatScene} scene
-   */
-  setMarks(at, scene) {
-    const { gl } = this;
-    gl.uniform1f(at("highlight"), scene.marks ? HIGHLIGHT : 0);
-    gl.activeTexture(gl.TEXTURE0 + MARKS_UNIT);
-    gl.bindTexture(gl.TEXTURE_2D, scene.marks ?? scene.geometry ?? null);
-    gl.uniform1i(at("marks"), MARKS_UNIT);
   }
 
   /** Draw each Gaussian of a scene's order as two triangles, with the current program. @param {SplatScene} scene */
@@ -227,7 +215,15 @@ export class Painter {
     gl.disableVertexAttribArray(1);
   }
 
-  /** @param {(name: string) => WebGLUniformLocation | null} at @param {number} width @param {number} height */
+  /** @param {Locate} at @param {SplatScene} scene @param {number} width @param {number} height */
+  setScene(at, scene, width, height) {
+    const { antialiased, eps2d } = scene.header?.rendering ?? CLASSIC;
+    this.setView(at, width, height);
+    this.gl.uniform1f(at("eps2d"), eps2d);
+    this.gl.uniform1i(at("antialiased"), Number(antialiased));
+  }
+
+  /** @param {Locate} at @param {number} width @param {number} height */
   setView(at, width, height) {
     const { gl, viewer: { camera } } = this, [fx, fy] = camera.pixels(width, height), [sx, sy] = camera.shift(width, height);
     gl.uniform2f(at("shift"), sx, sy);
@@ -240,8 +236,7 @@ export class Painter {
 
   /** @param {number} scale @param {boolean} through whether to keep transparency */
   composite(scale, through = false) {
-    const { gl } = this, { program, at } = /** @type {Program} */ (this.compose);
-    gl.useProgram(program);
+    const { gl } = this, at = this.use("whole", () => [wholeVertex, overBackground]);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.picture);
     gl.uniform1i(at("picture"), 0);
@@ -254,8 +249,7 @@ export class Painter {
 
   /** @param {Float32Array} lines pairs of points @param {number} width @param {number} height */
   drawLines(lines, width, height) {
-    const { gl } = this, { program, at } = /** @type {Program} */ (this.line);
-    gl.useProgram(program);
+    const { gl } = this, at = this.use("lines", () => [lineVertex, lineFragment]);
     this.setView(at, width, height);
     gl.uniform1f(at("near"), 1e-3 * this.viewer.camera.size);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.lineBuffer ?? null);

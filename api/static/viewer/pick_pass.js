@@ -5,16 +5,12 @@
  * A fragment is kept with the probability of its alpha, and nearer ones are drawn over farther ones. The one that stays
  * is therefore Gaussian i with probability alpha_i times the product of (1 - alpha) of all nearer ones, its weight.
  */
-import { CLASSIC } from "./render_tag.js";
 import { splatVertex } from "./shaders.js";
-
-/** @typedef {import("./viewer.js").Viewer} Viewer */
-/** @typedef {import("./painter.js").Program} Program */
 
 /** Longer side of the image in pixels. */
 const LONGER = 768;
-/** Texture unit to which nothing is bound. */
-const FREE_UNIT = 15;
+/** Samplers of colors, and a unit without an integer texture for them, in case the driver retains unused ones. */
+const COLORS = ["leftColors", "left1", "left2", "rightColors", "right1", "right2"], FREE_UNIT = 15;
 
 const pickFragment = `#version 300 es
 precision highp float; precision highp int;
@@ -55,71 +51,38 @@ export function gaussianAt({ ids, width, height }, x, y) {
   return found;
 }
 
-export class PickPass {
-  /** @param {Viewer} viewer */
-  constructor(viewer) {
-    this.viewer = viewer;
-    /** @type {Map<number, Program>} */
-    this.programs = new Map();
-  }
-
-  /**
-   * Draw the scene on the left side as the viewer's camera sees it.
-   *
-   * @returns {import("./selector.js").PickedView | null} null if there is none
-   */
-  draw() {
-    const { viewer } = this, { gl, camera } = viewer, scene = viewer.sides?.left.scene;
-    if (!scene?.drawn || !scene.geometry) return null;
-    const [w, h] = viewer.size(), scale = Math.min(1, LONGER / Math.max(w, h));
-    const width = Math.max(1, Math.round(w * scale)), height = Math.max(1, Math.round(h * scale));
-    const target = gl.createTexture(), frame = gl.createFramebuffer();
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, target);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, width, height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
-    gl.viewport(0, 0, width, height);
-    gl.disable(gl.BLEND);
-    gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
-    this.drawScene(scene, width, height);
-    const pixels = new Uint32Array(width * height * 4), ids = new Uint32Array(width * height);
-    gl.readPixels(0, 0, width, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, pixels);
-    for (let i = 0; i < ids.length; i++) ids[i] = pixels[4 * i];
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.deleteFramebuffer(frame);
-    gl.deleteTexture(target);
-    const { axes, eye, near } = camera;
-    return { axes, eye, near, focal: camera.pixels(width, height), ids, width, height };
-  }
-
-  /** @param {import("./splat_scene.js").SplatScene} scene @param {number} width @param {number} height */
-  drawScene(scene, width, height) {
-    const { viewer } = this, { gl } = viewer;
-    const { program, at } = this.programs.get(scene.bits) ?? viewer.painter.program(splatVertex(0, scene.bits), pickFragment);
-    this.programs.set(scene.bits, { program, at });
-    gl.useProgram(program);
-    viewer.painter.setView(at, width, height);
-    const { antialiased, eps2d } = scene.header?.rendering ?? CLASSIC;
-    gl.uniform1f(at("eps2d"), eps2d);
-    gl.uniform1i(at("antialiased"), Number(antialiased));
-    gl.bindTexture(gl.TEXTURE_2D, scene.geometry ?? null);
-    gl.uniform1i(at("geometry"), 0);
-    this.separateSamplers(program, at);
-    viewer.painter.drawInstances(scene);
-  }
-
-  /**
-   * Bind samplers of colors to a unit without an integer texture, in case the driver retains unused ones.
-   *
-   * @param {WebGLProgram} program
-   * @param {(name: string) => WebGLUniformLocation | null} at
-   */
-  separateSamplers(program, at) {
-    const { gl } = this.viewer;
-    for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); i++) {
-      const { name, type } = gl.getActiveUniform(program, i) ?? {};
-      if (name && type === gl.SAMPLER_2D) gl.uniform1i(at(name), FREE_UNIT);
-    }
-  }
+/**
+ * Draw the scene on the left side as the viewer's camera sees it.
+ *
+ * @param {import("./viewer.js").Viewer} viewer
+ * @returns {import("./selector.js").PickedView | null} null if there is none
+ */
+export function pickedView(viewer) {
+  const { gl, camera, painter } = viewer, scene = viewer.sides?.left.scene;
+  if (!scene?.drawn || !scene.geometry) return null;
+  const [w, h] = viewer.size(), scale = Math.min(1, LONGER / Math.max(w, h));
+  const width = Math.max(1, Math.round(w * scale)), height = Math.max(1, Math.round(h * scale));
+  const target = gl.createTexture(), frame = gl.createFramebuffer();
+  gl.activeTexture(gl.TEXTURE0);
+  gl.bindTexture(gl.TEXTURE_2D, target);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, width, height);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target, 0);
+  gl.viewport(0, 0, width, height);
+  gl.disable(gl.BLEND);
+  gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
+  const at = painter.use(`picks ${scene.bits}`, () => [splatVertex(0, scene.bits), pickFragment]);
+  painter.setScene(at, scene, width, height);
+  gl.bindTexture(gl.TEXTURE_2D, scene.geometry);
+  gl.uniform1i(at("geometry"), 0);
+  for (const name of COLORS) gl.uniform1i(at(name), FREE_UNIT);
+  painter.drawInstances(scene);
+  const pixels = new Uint32Array(width * height * 4), ids = new Uint32Array(width * height);
+  gl.readPixels(0, 0, width, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, pixels);
+  for (let i = 0; i < ids.length; i++) ids[i] = pixels[4 * i];
+  gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  gl.deleteFramebuffer(frame);
+  gl.deleteTexture(target);
+  const { axes, eye, near } = camera;
+  return { axes, eye, near, focal: camera.pixels(width, height), ids, width, height };
 }

@@ -2,7 +2,7 @@
 /** Readers of PLY files: of the reference code of 3D Gaussian Splatting, and PlayCanvas' compressed ones (github.com/playcanvas/splat-transform). */
 import { words } from "../words.js";
 import { CutError, SceneError } from "./byte_reader.js";
-import { BATCH, COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALE_LOW, SCALES, setRotation, SH_C0, unpacked } from "./packing.js";
+import { BATCH, COLOR, HARMONICS, LOGITS, NAMES, OPACITY, ROTATION, SCALE_LOW, SCALES, setRotation, SH_C0, unpacked } from "./packing.js";
 import { isFlat, plyRendering } from "./render_tag.js";
 
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
@@ -15,13 +15,15 @@ import { isFlat, plyRendering } from "./render_tag.js";
  *   `text`: whether values are written as text
  */
 
-const SIZES = /** @type {Record<string, number>} */ ({
-  char: 1, uchar: 1, int8: 1, uint8: 1, short: 2, ushort: 2, int16: 2, uint16: 2,
-  int: 4, uint: 4, int32: 4, uint32: 4, float: 4, float32: 4, double: 8, float64: 8,
+/** Readers of types: method of a DataView, and bytes. */
+const TYPES = /** @type {Record<string, ["getInt8" | "getUint8" | "getInt16" | "getUint16" | "getInt32" | "getUint32" | "getFloat32" | "getFloat64", number]>} */ ({
+  char: ["getInt8", 1], int8: ["getInt8", 1], uchar: ["getUint8", 1], uint8: ["getUint8", 1],
+  short: ["getInt16", 2], int16: ["getInt16", 2], ushort: ["getUint16", 2], uint16: ["getUint16", 2],
+  int: ["getInt32", 4], int32: ["getInt32", 4], uint: ["getUint32", 4], uint32: ["getUint32", 4],
+  float: ["getFloat32", 4], float32: ["getFloat32", 4], double: ["getFloat64", 8], float64: ["getFloat64", 8],
 });
-const NEEDED = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
 /** SH degree by the number of coefficients above degree 0. */
-export const DEGREES = /** @type {Record<number, number>} */ ({ 0: 0, 9: 1, 24: 2, 45: 3 });
+const DEGREES = /** @type {Record<number, number>} */ ({ 0: 0, 9: 1, 24: 2, 45: 3 });
 const TEXT = "format ascii 1.0";
 /** Maximum bytes of a header, and of a line of text. */
 const LONGEST_HEADER = 1 << 16;
@@ -68,7 +70,7 @@ function elementsOf(lines) {
     if (keyword === "element") elements.push({ name: kind, count: Number(name), stride: 0, columns: {}, little });
     else if (keyword === "property" && element) {
       element.columns[name] = { offset: element.stride, type: kind };
-      element.stride += SIZES[kind] ?? NaN; // a list, whose rows have no fixed size
+      element.stride += TYPES[kind]?.[1] ?? NaN; // a list, whose rows have no fixed size
     }
   }
   return elements;
@@ -77,7 +79,7 @@ function elementsOf(lines) {
 /** @param {ByteReader} reader reader behind the header @param {Header} header @returns {SceneFile} */
 export function plainPly(reader, { elements, comments, text }) {
   const [vertex] = elements, names = Object.keys(vertex?.columns ?? {}), rest = names.filter((name) => name.startsWith("f_rest_")).length;
-  const wrong = vertex?.name !== "vertex" || !(vertex.count > 0) || !(vertex.stride > 0) || NEEDED.some((name) => !vertex.columns[name] && !(name === "scale_2" && isFlat(names)));
+  const wrong = vertex?.name !== "vertex" || !(vertex.count > 0) || !(vertex.stride > 0) || NAMES.some((name) => !vertex.columns[name] && !(name === "scale_2" && isFlat(names)));
   if (wrong || !(rest in DEGREES)) {
     const variant = vertex?.columns.opacity && vertex.columns.rot_0; // such as colors of 8 bits, or SH degree 4
     throw new SceneError(variant ? words.scene.notShown("This kind of PLY") : words.scene.notGaussians);
@@ -104,7 +106,7 @@ async function* textLines(reader) {
     const part = await reader.some();
     const [...whole] = (line + new TextDecoder("latin1").decode(part ?? new Uint8Array(0))).split("\n");
     line = part ? /** @type {string} */ (whole.pop()) : "";
-    if (line.length > LONGEST_HEADER) throw new SceneError(words.scene.unreadable);
+    if (line.length > LONGEST_HEADER) throw new SceneError();
     for (const each of whole) if (each.trim()) yield each.trim();
     if (!part) return;
   }
@@ -123,7 +125,7 @@ async function numbers(written, count, width) {
     const { value } = await written.next();
     if (value === undefined) throw new CutError(words.scene.cut);
     const values = value.split(/\s+/);
-    if (values.length !== width) throw new SceneError(words.scene.unreadable);
+    if (values.length !== width) throw new SceneError();
     rows.set(values.map(Number), row * width);
   }
   return rows;
@@ -165,23 +167,14 @@ function withoutThickness(rows, width) {
  * @param {Element} element
  * @param {Uint8Array} bytes whole rows, at the start of their buffer
  */
-export function floats({ stride, columns, little }, bytes) {
+function floats({ stride, columns, little }, bytes) {
   const all = Object.values(columns);
   if (little && all.every(({ type }) => type === "float" || type === "float32")) return new Float32Array(bytes.buffer, 0, bytes.length / 4);
   const view = new DataView(bytes.buffer), count = bytes.length / stride, found = new Float32Array(count * all.length);
   all.forEach(({ offset, type }, place) => {
-    for (let row = 0; row < count; row++) found[row * all.length + place] = stored(view, row * stride + offset, type, little);
+    for (let row = 0; row < count; row++) found[row * all.length + place] = view[TYPES[type][0]](row * stride + offset, little);
   });
   return found;
-}
-
-/** @param {DataView} view @param {number} at @param {string} type @param {boolean} little */
-function stored(view, at, type, little) {
-  if (type === "double" || type === "float64") return view.getFloat64(at, little);
-  if (type.startsWith("float")) return view.getFloat32(at, little);
-  if (SIZES[type] === 1) return type.startsWith("u") ? view.getUint8(at) : view.getInt8(at);
-  if (SIZES[type] === 2) return type.startsWith("u") ? view.getUint16(at, little) : view.getInt16(at, little);
-  return type.startsWith("u") ? view.getUint32(at, little) : view.getInt32(at, little);
 }
 
 /** Number of Gaussians that share their bounds. */

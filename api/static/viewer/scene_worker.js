@@ -2,7 +2,7 @@
 /** Worker that reads a scene as it arrives, passes it on in batches, and sorts it for the viewer. */
 import { ByteReader, CutError, SceneError } from "./byte_reader.js";
 import { depthOrder } from "./depth_order.js";
-import { pack } from "./packing.js";
+import { harmonicTexels, pack } from "./packing.js";
 import { openScene } from "./scene_file.js";
 import { rgbOf, Selector } from "./selector.js";
 import { words } from "../words.js";
@@ -27,8 +27,8 @@ port.onmessage = async (/** @type {MessageEvent} */ { data }) => {
     try {
       await load(data.source, data.room);
     } catch (error) {
-      const told = error instanceof SceneError ? error.message : words.scene.unreadable;
-      port.postMessage({ kind: "failed", message: told, cut: error instanceof CutError, detail: String(error) });
+      const message = error instanceof SceneError ? error.message : words.scene.unreadable; // also if values are missing
+      port.postMessage({ kind: "failed", message, cut: error instanceof CutError });
     }
   }
 };
@@ -66,7 +66,7 @@ async function opened(source) {
  */
 function keptDegree(file, { texels, bytes }) {
   const fits = (/** @type {number} */ d) => {
-    const each = Math.ceil((((d + 1) ** 2 - 1) * 3) / 8);
+    const each = harmonicTexels(d);
     return file.count * Math.max(each, 2) <= texels && file.count * (48 + 16 * each) <= bytes;
   };
   let kept = file.degree;

@@ -1,10 +1,10 @@
 // @ts-check
 /** Selection of a scene's Gaussians: requests to the scene's worker, and a texture that highlights the selected ones. */
-import { PickPass } from "./pick_pass.js";
+import { pickedView } from "./pick_pass.js";
 
 /** @typedef {import("./viewer.js").Viewer} Viewer */
 /** @typedef {import("./splat_scene.js").SplatScene} SplatScene */
-/** @typedef {{begin: number, flags: Uint8Array, total: number, past: number, future: number, milliseconds: number, bits?: Uint8Array}} Changed `total`: selected Gaussians; `past` and `future`: changes that can be undone and redone */
+/** @typedef {{begin: number, flags: Uint8Array, total: number, past: number, future: number, bits?: Uint8Array}} Changed `total`: selected Gaussians; `past` and `future`: changes that can be undone and redone */
 
 /** Gaussians in the longest row of a texture; updates start at a multiple of it. */
 const ROW = 8192;
@@ -19,7 +19,6 @@ export class Selection {
     this.viewer = viewer;
     this.scene = scene;
     this.told = told;
-    this.picks = new PickPass(viewer);
     this.count = scene.header?.count ?? 0;
     this.flags = new Uint8Array(this.count);
     /** Pose that the worker knows, and size of its image. */
@@ -61,7 +60,7 @@ export class Selection {
   look() {
     const { viewer } = this, pose = viewer.poseNumber();
     if (pose === this.pose) return;
-    const view = this.picks.draw();
+    const view = pickedView(viewer);
     if (!view) return;
     if (this.scene.sortedFor === pose) this.pose = pose;
     this.size = [view.width, view.height];
@@ -72,11 +71,6 @@ export class Selection {
   point(x, y) {
     const { clientWidth, clientHeight } = this.viewer.canvas;
     return [(x * this.size[0]) / clientWidth, (y * this.size[1]) / clientHeight];
-  }
-
-  /** Return the selection as packed bits, the lowest bit first. */
-  async bits() {
-    return /** @type {Uint8Array} */ ((await this.ask("bits")).bits);
   }
 
   end() {

@@ -4,9 +4,9 @@
  *
  * Each change is stored as the list of Gaussians whose flag flips, so undoing flips them back. Positions in the view are
  * computed once per view. A Gaussian is visible in a view unless it is behind what the view shows where its center is;
- * this depth comes from an image of visible Gaussians (`PickPass`).
+ * this depth comes from an image of visible Gaussians (`pickedView`).
  */
-import { CellGrid } from "./cell_grid.js";
+import { SH_C0 } from "./packing.js";
 import { gaussianAt } from "./pick_pass.js";
 
 /** @typedef {{axes: number[][], eye: number[], focal: number[], near: number, ids: Uint32Array, width: number, height: number}} PickedView `ids`: one more than the index of the Gaussian that a pixel shows, or 0; rows from bottom to top */
@@ -18,7 +18,6 @@ const SQUARE = 4;
 const SURFACE = 0.75, THICKNESS = 0.6;
 /** Maximum number of stored flips of all changes that can be undone. */
 const MOST_FLIPS = 5e7;
-const SH_C0 = 0.28209479177387814;
 
 /**
  * Return the colors of rows as bytes, [n * 3].
@@ -70,10 +69,9 @@ export class Selector {
    * @param {any} request `op` is one of the methods below that take a request
    */
   answer(request) {
-    const begun = performance.now();
     const flips = request.op === "bits" ? [] : request.op === "view" ? this.setView(request) : this.change(request);
     const counts = { total: this.total, past: this.past.length, future: this.future.length };
-    return { ...this.range(flips), ...counts, ...(request.op === "bits" ? { bits: this.bits() } : {}), milliseconds: performance.now() - begun };
+    return { ...this.range(flips), ...counts, ...(request.op === "bits" ? { bits: this.bits() } : {}) };
   }
 
   /**
@@ -88,7 +86,7 @@ export class Selector {
     const undone = request.replaces ? this.move(this.past, []) : new Uint32Array(0);
     const found = /** @type {Record<string, (request: any) => ArrayLike<number>>} */ ({
       stroke: (each) => this.stroke(each), lasso: (each) => this.lasso(each), box: (each) => this.box(each), sphere: (each) => this.sphere(each),
-      similar: (each) => this.similar(each), grow: () => this.grow(), invert: () => this.all(() => true), clear: () => this.all((/** @type {number} */ i) => this.flags[i] === 1), load: (each) => this.load(each),
+      similar: (each) => this.similar(each), invert: () => this.all(() => true), clear: () => this.all((/** @type {number} */ i) => this.flags[i] === 1), load: (each) => this.load(each),
     })[request.op](request);
     const flips = Uint32Array.from(found);
     this.flip(flips);
@@ -256,16 +254,9 @@ export class Selector {
     const alike = (/** @type {number} */ i) => (colors[3 * i] - r) ** 2 + (colors[3 * i + 1] - g) ** 2 + (colors[3 * i + 2] - b) ** 2 <= most;
     if (!connected) return this.changing(mode, alike);
     const reached = new Uint8Array(this.count);
-    for (const i of this.cells().flood(seed, alike)) reached[i] = 1;
+    this.grid ??= new CellGrid(this.centers, this.count, this.radius);
+    for (const i of this.grid.flood(seed, alike)) reached[i] = 1;
     return this.changing(mode, (i) => reached[i] === 1);
-  }
-
-  grow() {
-    return this.cells().border(this.flags);
-  }
-
-  cells() {
-    return (this.grid ??= new CellGrid(this.centers, this.count, this.radius));
   }
 }
 
@@ -299,4 +290,100 @@ export function filled(points, width, height) {
     }
   }
   return found;
+}
+
+/** Bits of a cell's position along an axis, in the keys of cells. */
+const KEY_SIDE = 2 ** 16;
+/** Wanted mean number of Gaussians in an occupied cell. */
+const FEWEST = 3, MOST = 24;
+/** Steps along an axis to a cell and its neighbors. */
+const STEPS = [-1, 0, 1];
+/** Steps to a cell and the 26 around it, as differences of keys. */
+const AROUND = STEPS.flatMap((z) => STEPS.flatMap((y) => STEPS.map((x) => x + KEY_SIDE * (y + KEY_SIDE * z))));
+
+/** Grid of cells over the centers of a scene's Gaussians, for searches among neighbors. */
+class CellGrid {
+  /**
+   * @param {Float32Array} centers [n * 3]
+   * @param {number} count
+   * @param {number} radius radius of the bulk of the scene
+   */
+  constructor(centers, count, radius) {
+    this.centers = centers;
+    this.count = count;
+    /** Side of a cell, which is about twice the distance between neighbors on a surface. */
+    this.side = Math.max((7 * radius) / Math.sqrt(Math.max(count, 1)), 1e-9);
+    /** Cell of each Gaussian. */
+    this.cellOf = new Uint32Array(count);
+    /** Numbers of cells by key. @type {Map<number, number>} */
+    this.cells = new Map();
+    /** @type {number[]} */
+    this.keys = [];
+    /** Gaussians, cell by cell: those of a cell are `items[starts[cell]]` up to before `items[starts[cell + 1]]`. */
+    this.items = new Uint32Array(count);
+    this.starts = new Uint32Array(0);
+    for (let attempt = 0; attempt < 6; attempt++) {
+      this.assign();
+      const mean = count / Math.max(this.keys.length, 1);
+      if (mean >= FEWEST && mean <= MOST) break;
+      this.side *= mean < FEWEST ? 1.5 : 0.6;
+    }
+    this.assign();
+    this.sort();
+  }
+
+  /** Assign each Gaussian to a cell. Positions far outside share the cells at the border. */
+  assign() {
+    const { centers, count, side } = this, half = KEY_SIDE / 2;
+    this.cells = new Map();
+    this.keys = [];
+    const along = (/** @type {number} */ value) => Math.min(KEY_SIDE - 2, Math.max(1, Math.floor(value / side) + half)) || 1; // NaN: 1
+    for (let i = 0; i < count; i++) {
+      const key = along(centers[3 * i]) + KEY_SIDE * (along(centers[3 * i + 1]) + KEY_SIDE * along(centers[3 * i + 2]));
+      let cell = this.cells.get(key);
+      if (cell === undefined) {
+        cell = this.keys.length;
+        this.cells.set(key, cell);
+        this.keys.push(key);
+      }
+      this.cellOf[i] = cell;
+    }
+  }
+
+  /** List the Gaussians cell by cell. */
+  sort() {
+    const { cellOf, count, items } = this, starts = new Uint32Array(this.keys.length + 1);
+    for (let i = 0; i < count; i++) starts[cellOf[i] + 1]++;
+    for (let cell = 0; cell < this.keys.length; cell++) starts[cell + 1] += starts[cell];
+    const next = starts.slice();
+    for (let i = 0; i < count; i++) items[next[cellOf[i]]++] = i;
+    this.starts = starts;
+  }
+
+  /**
+   * Return the Gaussians that pass a test and are connected to one of them: cells are connected if they touch and both
+   * hold a Gaussian that passes.
+   *
+   * @param {number} seed a Gaussian that passes
+   * @param {(i: number) => boolean} passes
+   * @returns {number[]}
+   */
+  flood(seed, passes) {
+    const reached = new Uint8Array(this.keys.length), waiting = [this.cellOf[seed]];
+    /** @type {number[]} */
+    const found = [];
+    reached[waiting[0]] = 1;
+    for (let cell = waiting.pop(); cell !== undefined; cell = waiting.pop()) {
+      const before = found.length;
+      for (let k = this.starts[cell]; k < this.starts[cell + 1]; k++) if (passes(this.items[k])) found.push(this.items[k]);
+      if (found.length === before) continue;
+      for (const step of AROUND) {
+        const other = this.cells.get(this.keys[cell] + step);
+        if (other === undefined || reached[other]) continue;
+        reached[other] = 1;
+        waiting.push(other);
+      }
+    }
+    return found;
+  }
 }

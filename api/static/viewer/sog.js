@@ -37,11 +37,7 @@ export async function sog(reader) {
   const files = await unzipped(await reader.all());
   const [index] = [...files.keys()].filter((name) => `/${name}`.endsWith(`/${INDEX}`)).sort((a, b) => a.length - b.length);
   if (index === undefined && !files.has(META)) throw new SceneError(words.scene.notScene);
-  try {
-    return { ...joined(index === undefined ? [await sogPart(files)] : await finestParts(files, index)), front: SUPERSPLAT };
-  } catch (error) {
-    throw error instanceof SceneError ? error : new SceneError(words.scene.unreadable); // values are missing or wrong
-  }
+  return { ...joined(index === undefined ? [await sogPart(files)] : await finestParts(files, index)), front: SUPERSPLAT };
 }
 
 /**
@@ -69,7 +65,7 @@ async function finestParts(files, name) {
 /** @param {import("./byte_reader.js").Files} files @param {string} name @returns {Promise<any>} */
 async function json(files, name) {
   const load = files.get(name);
-  if (!load) throw new SceneError(words.scene.unreadable);
+  if (!load) throw new SceneError();
   return JSON.parse(new TextDecoder().decode(await load()));
 }
 
@@ -96,7 +92,7 @@ async function sogPart(files) {
   const image = async (/** @type {any} */ entry, index = 0) => (await decoded(files, entry.files[index], count, 2 * count + 65536)).bytes;
   const palette = shN && await decoded(files, shN.files[0], 1, MAX_PALETTE_PIXELS);
   const coefficients = palette ? COEFFICIENTS[palette.width] : 0;
-  if (coefficients === undefined) throw new SceneError(words.scene.unreadable);
+  if (coefficients === undefined) throw new SceneError();
   const [low, high] = [means.mins, means.maxs].map((side) => Float64Array.from(side));
   const scaleOf = table(scales, 3), colorOf = table(sh0, 4), harmonicOf = shN && table(shN, 1);
   const opacityOf = version === 2 ? LOGITS : colorOf[3];
@@ -117,11 +113,11 @@ async function sogPart(files) {
       }
       into[o + OPACITY] = opacityOf[color[p + 3]];
       const largest = rotation[p + 3] - FIRST_TAG;
-      if (largest < 0) throw new SceneError(words.scene.unreadable);
+      if (largest < 0) throw new SceneError();
       setRotation(into, o + ROTATION, largest, [0, 1, 2].map((part) => (rotation[p + part] / 255 - 0.5) * Math.SQRT2));
       for (let n = 0; n < coefficients; n++) {
         const v = 4 * ((label[p] | (label[p + 1] << 8)) * coefficients + n);
-        if (v >= palette.bytes.length) throw new SceneError(words.scene.unreadable);
+        if (v >= palette.bytes.length) throw new SceneError();
         for (let c = 0; c < 3; c++) into[o + HARMONICS + c * stride + n] = harmonicOf[0][palette.bytes[v + c]];
       }
     }
@@ -169,10 +165,10 @@ let context = null;
  */
 async function decoded(files, name, least, most) {
   const content = await files.get(name)?.();
-  if (!content) throw new SceneError(words.scene.unreadable);
+  if (!content) throw new SceneError();
   const image = await createImageBitmap(new Blob([content]), { premultiplyAlpha: "none", colorSpaceConversion: "none" });
   const { width, height } = image, gl = context ??= new OffscreenCanvas(1, 1).getContext("webgl2");
-  if (!gl || width * height < least || width * height > most) throw new SceneError(words.scene.unreadable);
+  if (!gl || width * height < least || width * height > most) throw new SceneError();
   const texture = gl.createTexture(), frame = gl.createFramebuffer(), bytes = new Uint8Array(4 * width * height);
   gl.bindTexture(gl.TEXTURE_2D, texture);
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);

@@ -1,6 +1,5 @@
 // @ts-check
 /** Readers of .splat (github.com/antimatter15/splat) and mkkellogg's .ksplat, as `sgsst_core/files/formats/splat.py` describes it. */
-import { words } from "../words.js";
 import { fromHalf, SceneError } from "./byte_reader.js";
 import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, SH_C0, unpacked } from "./packing.js";
 
@@ -79,11 +78,11 @@ export function isKsplat(start) {
 export async function ksplat(reader) {
   const head = new DataView((await reader.take(HEADER)).buffer), number = head.getUint32(4, true), count = head.getUint32(16, true);
   const level = head.getUint16(20, true), low = head.getFloat32(36, true) || -RANGE, high = head.getFloat32(40, true) || RANGE;
-  if (number > MAX_SECTIONS) throw new SceneError(words.scene.unreadable);
+  if (number > MAX_SECTIONS) throw new SceneError();
   const table = new DataView((await reader.take(number * SECTION)).buffer);
   const sections = Array.from({ length: number }, (_, i) => sectionAt(table, i * SECTION));
   const degree = Math.max(...sections.map((section) => section.degree)), coefficients = (degree + 1) ** 2 - 1;
-  if (sections.reduce((sum, section) => sum + section.count, 0) !== count || !(degree < 3)) throw new SceneError(words.scene.unreadable);
+  if (sections.reduce((sum, section) => sum + section.count, 0) !== count || !(degree < 3)) throw new SceneError();
   /** @type {(row: DataView, place: number) => number} */
   const value = level ? (row, place) => fromHalf(row.getUint16(place, true)) : (row, place) => row.getFloat32(place, true);
   const harmonic = level < 2 ? value : (/** @type {DataView} */ row, /** @type {number} */ place) => low + (high - low) * (row.getUint8(place) / 255);
@@ -113,7 +112,7 @@ export async function ksplat(reader) {
         if (level) {
           while (begun + i >= bucketEnd) {
             bucket++;
-            if (bucket >= section.full + section.partial) throw new SceneError(words.scene.unreadable);
+            if (bucket >= section.full + section.partial) throw new SceneError();
             bucketEnd += bucket < section.full ? section.bucketSize : lengths[bucket - section.full];
           }
         }
@@ -146,7 +145,7 @@ export async function ksplat(reader) {
 function sectionAt(table, o) {
   const integer = (/** @type {number} */ place) => table.getUint32(o + place, true);
   const steps = integer(24) || STEPS, count = integer(0), room = integer(4);
-  if (count > room) throw new SceneError(words.scene.unreadable);
+  if (count > room) throw new SceneError();
   return {
     count, room, degree: table.getUint16(o + 40, true), bucketSize: integer(8), buckets: integer(12), full: integer(32),
     partial: integer(36), step: table.getFloat32(o + 16, true) / 2 / steps, steps,

@@ -1,6 +1,6 @@
 // @ts-check
 /** A scene on the GPU: geometry and harmonics once, and any number of color sets. */
-import { BATCH, harmonicTexels } from "./packing.js";
+import { harmonicTexels } from "./packing.js";
 import { words } from "../words.js";
 
 /** @typedef {{center: number[], radius: number, low: number[], high: number[]}} Middle */
@@ -143,21 +143,10 @@ export class SplatScene {
    */
   async addColors(name, stream) {
     await this.headerRead;
-    const { gl } = this, count = this.header?.count ?? 0;
-    const whole = new Uint8Array(count * 6), reader = stream.getReader();
-    let filled = 0;
-    for (;;) {
-      const { value, done } = await reader.read();
-      if (done) break;
-      if (filled + value.length > whole.length) throw new Error(words.scene.otherColors);
-      whole.set(value, filled);
-      filled += value.length;
-    }
-    if (filled !== whole.length) throw new Error(words.scene.otherColors);
-    const halves = new Uint16Array(whole.buffer), texture = this.colors.get(name) ?? this.texture(gl.RGB16F, count);
-    for (let begin = 0; begin < count; begin += BATCH) {
-      this.fill(texture, begin, halves.subarray(begin * 3, Math.min(count, begin + BATCH) * 3), gl.RGB, gl.HALF_FLOAT, 3);
-    }
+    const { gl } = this, count = this.header?.count ?? 0, bytes = await new Response(stream).arrayBuffer();
+    if (bytes.byteLength !== count * 6) throw new Error(words.scene.otherColors);
+    const texture = this.colors.get(name) ?? this.texture(gl.RGB16F, count);
+    this.fill(texture, 0, new Uint16Array(bytes), gl.RGB, gl.HALF_FLOAT, 3);
     this.colors.set(name, texture);
     this.changed();
   }
@@ -173,13 +162,11 @@ export class SplatScene {
    *
    * @param {Pose} pose
    * @param {number} number number of the pose
-   * @returns {boolean} whether it was requested
    */
   sort(pose, number) {
-    if (this.busy || !this.loaded) return false;
+    if (this.busy || !this.loaded) return;
     this.busy = true;
     this.worker.postMessage({ kind: "sort", pose, number });
-    return true;
   }
 
   /** @param {{order: Uint32Array, number: number, of: number}} told */
@@ -195,12 +182,6 @@ export class SplatScene {
     this.drawn = order.length;
     this.sortedOf = of;
     this.sortedFor = number;
-  }
-
-  /** Bytes of the scene's textures and its order. */
-  get bytes() {
-    const count = this.header?.count ?? 0;
-    return count * (32 + 16 * (this.texels ?? 0) + 6 * this.colors.size + Number(!!this.marks)) + this.room * 4;
   }
 
   /** Free all resources. */

@@ -53,13 +53,13 @@ export async function spz4(reader) {
   const head = new DataView((await reader.take(32)).buffer), table = head.getUint32(16, true);
   return spzScene(head, async (sizes) => {
     const streams = sizes.filter(Boolean);
-    if (table < 32 || table > 32 + MAX_EXTENSIONS || head.getUint8(15) !== streams.length) throw new SceneError(words.scene.unreadable);
+    if (table < 32 || table > 32 + MAX_EXTENSIONS || head.getUint8(15) !== streams.length) throw new SceneError();
     const rotated = statesRub(await reader.take(table - 32)), list = new DataView((await reader.take(16 * streams.length)).buffer);
     /** @type {Uint8Array<ArrayBuffer>[]} */
     const sections = [];
     for (const [i, size] of streams.entries()) {
       const stream = await reader.take(list.getUint32(16 * i, true)), section = new Uint8Array(size);
-      if (list.getUint32(16 * i + 8, true) !== size || decompress(stream, section).length !== size) throw new SceneError(words.scene.unreadable);
+      if (list.getUint32(16 * i + 8, true) !== size || decompress(stream, section).length !== size) throw new SceneError();
       sections.push(section);
     }
     return { sections: [...sections, new Uint8Array(0)], rotated };

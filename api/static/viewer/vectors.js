@@ -22,6 +22,13 @@ export function rotated(a, axis, angle) {
   return a.map((value, i) => value * c + across[i] * s + axis[i] * along);
 }
 
+/** Return the rows of the rotation of a unit quaternion. @param {number[]} quaternion xyzw */
+export const turnOf = ([x, y, z, w]) => [
+  [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+  [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+  [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+];
+
 /** Polynomials of the view direction: coefficients of products such as "xxy". @type {Record<string, number>[]} */
 const BASIS = [
   { y: -0.4886025119029199 }, { z: 0.4886025119029199 }, { x: -0.4886025119029199 },

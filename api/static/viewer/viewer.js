@@ -2,7 +2,7 @@
 /** Viewer of one or two scenes with two color sets and a wipe between them. It draws only after a change. */
 import { ViewCamera } from "./camera.js";
 import { Painter } from "./painter.js";
-import { gaussianAt, PickPass } from "./pick_pass.js";
+import { gaussianAt, pickedView } from "./pick_pass.js";
 import { SplatScene } from "./splat_scene.js";
 import { words } from "../words.js";
 
@@ -54,10 +54,9 @@ export class Viewer {
     this.painter = new Painter(this);
     /** @type {WebGLSync | null} */
     this.fence = null;
-    this.onLost = (/** @type {Event} */ event) => this.lose(event);
-    this.onRestored = () => this.restore();
-    canvas.addEventListener("webglcontextlost", this.onLost);
-    canvas.addEventListener("webglcontextrestored", this.onRestored);
+    this.leaving = new AbortController();
+    canvas.addEventListener("webglcontextlost", (event) => this.lose(event), { signal: this.leaving.signal });
+    canvas.addEventListener("webglcontextrestored", () => this.restore(), { signal: this.leaving.signal });
     this.resized = new ResizeObserver(() => this.draw());
     this.resized.observe(canvas);
   }
@@ -222,7 +221,7 @@ export class Viewer {
    * @returns {Promise<number[] | null>}
    */
   async pointAt(x, y) {
-    const view = new PickPass(this).draw(), { clientWidth, clientHeight } = this.canvas;
+    const view = pickedView(this), { clientWidth, clientHeight } = this.canvas;
     const index = view ? gaussianAt(view, (x * view.width) / clientWidth, (y * view.height) / clientHeight) : -1;
     return index < 0 ? null : /** @type {Side} */ (this.sides?.left).scene.centerOf(index);
   }
@@ -255,8 +254,7 @@ export class Viewer {
     this.ended = true;
     cancelAnimationFrame(this.requested);
     this.resized.disconnect();
-    this.canvas.removeEventListener("webglcontextlost", this.onLost);
-    this.canvas.removeEventListener("webglcontextrestored", this.onRestored);
+    this.leaving.abort();
     for (const scene of new Set([this.sides?.left.scene, this.sides?.right.scene])) scene?.end();
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
