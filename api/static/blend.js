@@ -6,8 +6,6 @@ import { resultName } from "./names.js";
 import { resultFormats } from "./tables.js";
 import { words } from "./words.js";
 
-/** @typedef {import("./viewer/viewer.js").Part} Part */
-
 const say = words.blend;
 
 export class Blend {
@@ -23,7 +21,7 @@ export class Blend {
     /** Fraction of style, 0 to 1.5, and of the second result in it, 0 to 1. */
     this.style = 1;
     this.second = jobs.length > 1 ? 0.5 : 0;
-    /** Color sets with their weights: the original, then the results. @type {Part[]} */
+    /** Color sets with their weights: the original, then the results. @type {import("./viewer/viewer.js").Part[]} */
     this.parts = ["own", ...jobs.map(({ id }) => id)].map((colors) => ({ colors, weight: 0 }));
     this.styleSlider = this.slider(say.style, 150, (value) => (this.style = value));
     this.secondSlider = this.slider(say.between(names[0], names[1] ?? ""), 100, (value) => (this.second = value));

@@ -146,23 +146,12 @@ export function ringCameras(middle, { count, up, elevation, radius }) {
  * @param {number} size size of a frame, world units
  */
 export function cameraLines(cameras, size) {
-  const points = new Float32Array(cameras.length * 8 * 2 * 3);
-  let at = 0;
-  const line = (/** @type {Vector} */ a, /** @type {Vector} */ b) => {
-    points.set(a, at);
-    points.set(b, at + 3);
-    at += 6;
-  };
-  for (const { position, axes: [right, down, forward], fx, fy, width, height } of cameras) {
+  return Float32Array.from(cameras.flatMap(({ position, axes: [right, down, forward], fx, fy, width, height }) => {
     const x = (size * width) / 2 / fx, y = (size * height) / 2 / fy;
     const corner = (/** @type {number} */ i, /** @type {number} */ j) => [times(right, i * x), times(down, j * y), times(forward, size)].reduce(sum, position);
     const corners = [corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)];
-    corners.forEach((place, i) => {
-      line(position, place);
-      line(place, corners[(i + 1) % 4]);
-    });
-  }
-  return points;
+    return corners.flatMap((place, i) => [position, place, place, corners[(i + 1) % 4]]).flat();
+  }));
 }
 
 /**

@@ -3,7 +3,7 @@
 import { h, put, svg } from "./dom.js";
 import { rough, words } from "./words.js";
 
-/** @typedef {{attempt: number, stage: string, step: number, seconds: number | null, loss: number | null, scales?: number[] | null, mean_loss?: number | null, mean_scales?: number[] | null}} Point */
+/** @typedef {{attempt: number, stage: string, step: number, seconds: number | null, loss: number | null, mean_loss?: number | null}} Point */
 
 const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 26, BOTTOM = 34;
 
@@ -13,7 +13,7 @@ const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 26, BOTTOM = 34;
  * @param {number} low
  * @param {number} high
  */
-export function ticks(low, high) {
+function ticks(low, high) {
   const decades = Math.log10(high / low);
   const digits = decades < 0.5 ? [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9] : decades < 1.2 ? [1, 2, 3, 5, 7] : decades < 4 ? [1, 2, 5] : [1];
   const found = [], every = Math.max(1, Math.ceil(decades / 8));
@@ -35,7 +35,7 @@ export class LossChart {
     this.element = h("div.chart", this.empty, this.picture, this.legend);
     /** @type {Map<string, Point>} */
     this.points = new Map();
-    this.requested = false;
+    this.requested = 0;
     this.resized = new ResizeObserver(() => this.later());
     this.resized.observe(this.picture);
   }
@@ -57,10 +57,8 @@ export class LossChart {
   }
 
   later() {
-    if (this.requested) return;
-    this.requested = true;
-    requestAnimationFrame(() => {
-      this.requested = false;
+    this.requested ||= requestAnimationFrame(() => {
+      this.requested = 0;
       this.draw();
     });
   }
@@ -71,11 +69,10 @@ export class LossChart {
     const of = (/** @type {string} */ stage) => all.filter((point) => point.stage === stage), sos = of("sos");
     const line = (/** @type {Point[]} */ points, /** @type {(p: Point) => number | null | undefined} */ value) =>
       /** @type {[number, number][]} */ (points.filter((p) => (value(p) ?? 0) > 0).map((p) => [p.seconds, value(p)]));
-    const scales = Math.max(0, ...sos.map((point) => point.scales?.length ?? 0)), mean = (/** @type {Point} */ p) => p.mean_loss ?? p.loss;
+    const mean = (/** @type {Point} */ p) => p.mean_loss ?? p.loss;
     return [
       ...(sos.some((p) => p.mean_loss) ? [{ name: words.chart.single, kind: "single", line: line(sos, (p) => p.loss) }] : []),
       { name: words.chart.coarse, kind: "coarse", line: line(of("coarse"), mean) },
-      ...(scales > 1 ? Array.from({ length: scales }, (_, n) => ({ name: words.chart.scale(n), kind: `scale scale${n % 5}`, line: line(sos, (p) => (p.mean_scales ?? p.scales)?.[n]) })) : []),
       { name: words.chart.all, kind: "all", line: line(sos, mean) },
     ].filter((each) => each.line.length);
   }

@@ -1,7 +1,7 @@
 // @ts-check
 /** Panel to crop a scene to a box in the 3D view: what lies outside keeps its colors. */
-import { announce, h, icon } from "./dom.js";
-import { button } from "./fields.js";
+import { announce, h } from "./dom.js";
+import { button, tool } from "./fields.js";
 import { outline, shapeAround, ShapeTool } from "./shapes.js";
 import { words } from "./words.js";
 
@@ -10,13 +10,13 @@ import { words } from "./words.js";
 const say = words.crop;
 
 /** Return the box of numbers "X0,Y0,Z0,X1,Y1,Z1". @param {string} text @returns {Shape} */
-export function boxOf(text) {
+function boxOf(text) {
   const numbers = text.split(",").map(Number), far = numbers.slice(3);
   return { kind: "box", center: far.map((value, axis) => (value + numbers[axis]) / 2), sizes: far.map((value, axis) => Math.abs(value - numbers[axis]) / 2) };
 }
 
 /** Return the text of a box. @param {Shape} shape */
-export const boxText = ({ center, sizes }) => [-1, 1].flatMap((sign) => center.map((value, axis) => Number((value + sign * sizes[axis]).toPrecision(5)))).join(",");
+const boxText = ({ center, sizes }) => [-1, 1].flatMap((sign) => center.map((value, axis) => Number((value + sign * sizes[axis]).toPrecision(5)))).join(",");
 
 export class CropPanel {
   /**
@@ -30,7 +30,7 @@ export class CropPanel {
     this.changed = changed;
     /** Text of the box in use; "" for none. */
     this.box = "";
-    this.button = h("button.tool", { type: "button", title: say.crop, "aria-label": say.crop, "aria-pressed": "false", hidden: true, onclick: () => (this.element.hidden ? this.open() : this.close()) }, icon("crop"));
+    this.button = tool("crop", say.crop, () => (this.element.hidden ? this.open() : this.close()), { hidden: true, "aria-pressed": "false" });
     this.remove = button(say.remove, () => this.use(""));
     this.first = button(say.use, () => this.use(this.tool.shape ? boxText(this.tool.shape) : ""), "primary");
     this.tool = new ShapeTool(stage, (lines) => this.draw(lines));

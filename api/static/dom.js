@@ -89,7 +89,7 @@ const ICONS = {
   turn: "M15.5 7.5A6.5 6.5 0 1 0 16.5 11M16 3.5v4h-4", tip: "M4 8h12v8H4zM7 8V4.5h6V8M10 10.5v4M8.3 13l1.7 1.8 1.7-1.8", crop: "M6 2.5V14h11.5M2.5 6H14v11.5",
   brush: "M16.5 3.5 9 11l-2-2 7.5-7.5zM7.5 12c-2.5-1-4 .5-4 4.5 4 0 5.5-1.5 4.5-4",
   pen: "m4 16 .8-3.4L13 4.4l2.6 2.6-8.2 8.2z",
-  pause: "M7.5 5v10M12.5 5v10", play: "M7 5l8 5-8 5z", close: "M5 5l10 10M15 5 5 15", plus: "M10 4v12M4 10h12", out: "M9 4H4v12h5M8 10h8m-3-3 3 3-3 3",
+  play: "M7 5l8 5-8 5z", close: "M5 5l10 10M15 5 5 15", plus: "M10 4v12M4 10h12", out: "M9 4H4v12h5M8 10h8m-3-3 3 3-3 3",
 };
 
 /** @param {keyof typeof ICONS} name */

@@ -6,6 +6,9 @@ import { words } from "./words.js";
 /** @param {string} name @param {() => void} onclick @param {string} [kind] */
 export const button = (name, onclick, kind = "quiet") => h(`button.${kind}.small`, { type: "button", onclick }, name);
 
+/** @param {Parameters<typeof icon>[0]} picture @param {string} name @param {() => void} onclick @param {Record<string, any>} [more] */
+export const tool = (picture, name, onclick, more) => h("button.tool", { type: "button", title: name, "aria-label": name, onclick, ...more }, icon(picture));
+
 /**
  * Create buttons of which one is pressed, the first one at the start.
  *

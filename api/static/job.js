@@ -37,9 +37,10 @@ export class JobView {
     /** @type {any} */
     this.job = null;
     this.chart = new LossChart();
-    this.lastEvent = "";
     this.name = new JobName(id, (job) => this.use(job), (error) => this.tellError(error));
     this.stage = new JobStage(id, this.leaving.signal, before);
+    /** Gives the 3D view to that of another job. */
+    this.handOver = (/** @type {string} */ id) => this.stage.handOver(id);
     this.state = new JobProgress();
     this.badge = h("span");
     this.meta = h("p.meta");
@@ -108,12 +109,6 @@ export class JobView {
     this.use(await get(`v1/jobs/${this.id}`, this.leaving.signal));
   }
 
-  /** @param {any} job */
-  use(job) {
-    this.job = job;
-    this.update();
-  }
-
   async loadHistory() {
     try {
       this.chart.add((await get(`v1/jobs/${this.id}/progress`, this.leaving.signal)).points);
@@ -170,12 +165,10 @@ export class JobView {
   onArtifact({ name }) {
     if (name.startsWith(PREVIEW)) this.stage.showPreview(name);
     else if (name === LIVE && this.stage.live) this.stage.paint();
-    else this.filesLater();
-  }
-
-  filesLater() {
-    clearTimeout(this.waiting);
-    this.waiting = setTimeout(() => this.loadFiles(), 400);
+    else {
+      clearTimeout(this.waiting);
+      this.waiting = setTimeout(() => this.loadFiles(), 400);
+    }
   }
 
   /** @param {{status: string}} told */
@@ -194,13 +187,9 @@ export class JobView {
     return !!this.job.parameters.painted?.length;
   }
 
-  /** Give the 3D view to that of another job. @param {string} id */
-  handOver(id) {
-    return this.stage.handOver(id);
-  }
-
-  update() {
-    const { job } = this;
+  /** @param {any} job */
+  use(job) {
+    this.job = job;
     this.title = nameOf(job);
     document.title = words.page.title(this.title);
     this.stage.name(this.title);
@@ -216,7 +205,7 @@ export class JobView {
     this.error.hidden = !job.error;
     if (job.error) put(this.error, h("strong", say.failed), h("p", job.error.message));
     this.showActions();
-    this.state.show(this.job);
+    this.state.show(job);
     put(this.facts, factsCard(job));
   }
 
@@ -263,40 +252,30 @@ export class JobView {
     } catch {
       return;
     }
-    const names = new Set(found.map(({ name }) => name));
-    const previews = found.map(({ name }) => name).filter((name) => name.startsWith(PREVIEW)).sort();
-    if (previews.length) this.stage.showPreview(previews[previews.length - 1]);
+    const names = new Set(found.map(({ name }) => name)), preview = [...names].filter((name) => name.startsWith(PREVIEW)).sort().at(-1);
+    if (preview) this.stage.showPreview(preview);
     else this.stage.showNoPreview(UNFINISHED.has(this.job.status) ? say.noPreview : "");
     this.files.hidden = false;
     put(this.files, filesCard(this.id, found.filter(({ name }) => !/^(previews|live)\//.test(name))));
-    if (names.has("plan.json") && this.plan.hidden) await this.loadPlan();
+    if (names.has("plan.json") && this.plan.hidden) {
+      const plan = await get(artifactPath(this.id, "plan.json"), this.leaving.signal).catch(() => null); // the job is shown without it
+      this.plan.hidden = !plan;
+      put(this.plan, planOf(this.planTitle, plan?.decisions ?? []));
+    }
     const result = found.find(({ name }) => name === "stylized.ply"), video = found.find(({ name }) => name === "video.mp4");
     this.stage.showLive(this.job, names);
     if (this.job.status !== "succeeded" || !result) return;
-    if (installed.video || video) this.offerVideo(video);
+    if (!this.video && (installed.video || video)) {
+      this.video = new VideoCard(this.job, this.leaving.signal);
+      put(this.film, this.video.element);
+      this.film.hidden = false;
+    }
+    if (video) this.video?.play(video);
     if (this.stage.finishing) return;
     this.download.hidden = this.sharing.hidden = false;
     put(this.download, downloadCard(this.id, result.size));
     put(this.sharing, new ShareCard(this.id).element);
     await this.stage.finish(this.job, names.has("before_after.jpg"));
-  }
-
-  /** @param {any} video artifact; undefined if there is none yet */
-  offerVideo(video) {
-    this.video ??= new VideoCard(this.job, this.leaving.signal);
-    if (!this.film.firstChild) put(this.film, this.video.element);
-    this.film.hidden = false;
-    if (video) this.video.play(video);
-  }
-
-  async loadPlan() {
-    try {
-      const plan = await get(artifactPath(this.id, "plan.json"), this.leaving.signal);
-      this.plan.hidden = false;
-      put(this.plan, planOf(this.planTitle, plan.decisions ?? []));
-    } catch {
-      // the job is shown without its plan
-    }
   }
 
   end() {

@@ -2,6 +2,7 @@
 /** Parts of a job's view: its name, progress, result, files, inputs, links for others, and video. */
 import { artifactPath, ask, eventsOf, get, Problem } from "./api.js";
 import { announce, h, icon, messageOf, put, tell } from "./dom.js";
+import { tool } from "./fields.js";
 import { titleOf, valueText } from "./options.js";
 import { downloads, installed, statusTitles, UNFINISHED } from "./tables.js";
 import { size, time, words } from "./words.js";
@@ -62,7 +63,7 @@ export class JobName {
 
   offer() {
     this.heading.hidden = false;
-    put(this.control, h("button.tool", { type: "button", title: say.rename, "aria-label": say.rename, onclick: () => this.edit() }, icon("pen")));
+    put(this.control, tool("pen", say.rename, () => this.edit()));
   }
 
   /** Replace the heading by an input. Enter saves the name, Escape discards it. */

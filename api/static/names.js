@@ -42,23 +42,13 @@ export const resultName = ({ parameters }) => (parameters?.painted?.length ? wor
  * @returns {string[]}
  */
 export function labels(jobs) {
-  const ways = [stylesOf, (/** @type {any} */ job) => nameOf(job), (/** @type {any} */ job) => time(job.created_at)];
-  const found = jobs.map(() => /** @type {string[]} */ ([]));
-  const joined = () => found.map((parts) => parts.join(", "));
-  for (const way of ways) {
-    const before = joined();
-    const texts = jobs.map(way);
-    jobs.forEach((_, i) => {
-      const alike = jobs.filter((_, k) => before[k] === before[i]).length;
-      const differs = jobs.some((_, k) => before[k] === before[i] && texts[k] !== texts[i]);
-      if (way === stylesOf || (alike > 1 && differs)) found[i].push(texts[i]);
-    });
+  let found = jobs.map(stylesOf);
+  for (const way of [nameOf, (/** @type {any} */ job) => time(job.created_at)]) {
+    const before = found, texts = jobs.map(way);
+    found = before.map((text, i) => (jobs.some((_, k) => before[k] === text && texts[k] !== texts[i]) ? `${text}, ${texts[i]}` : text));
   }
-  const texts = joined();
-  return texts.map((text, i) => {
-    const number = texts.slice(0, i).filter((each) => each === text).length + 1;
-    return texts.filter((each) => each === text).length > 1 ? `${text} (${number})` : text;
-  });
+  const number = (/** @type {number} */ i) => found.slice(0, i + 1).filter((each) => each === found[i]).length;
+  return found.map((text, i) => (found.indexOf(text) === found.lastIndexOf(text) ? text : `${text} (${number(i)})`));
 }
 
 /** Return a text as part of a file name. @param {string} text */

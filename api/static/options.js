@@ -66,7 +66,7 @@ export function optionControl(name, schema, { title = titleOf(name), hint = true
  * @param {any} value
  * @returns {string}
  */
-export function problemOf(kinds, value) {
+function problemOf(kinds, value) {
   if (value === undefined || typeof value === "boolean") return "";
   const array = kinds.find((kind) => kind.type === "array"), numeric = kinds.find(isNumber);
   if (Array.isArray(value)) return array?.items ? value.map((each) => problemOf([array.items], each)).find(Boolean) ?? "" : "";

@@ -12,8 +12,7 @@ import { forgetDraft, keptDraft } from "./stored.js";
 import { SubmitView } from "./submit.js";
 import { words } from "./words.js";
 
-/** @typedef {import("./stage.js").Stage} Stage */
-/** @typedef {{title: string, element: HTMLElement, end: () => void, handOver?: (id: string) => Stage | undefined}} View `handOver`: gives its 3D view to that of a job */
+/** @typedef {{title: string, element: HTMLElement, end: () => void, handOver?: (id: string) => import("./stage.js").Stage | undefined}} View `handOver`: gives its 3D view to that of a job */
 
 const say = words.page;
 const main = h("main", { id: "main", tabIndex: -1 });

@@ -52,7 +52,7 @@ export class PaintPanel {
     this.wrong = h("p.wrong", { hidden: true, role: "alert" });
     this.element = h("section.selecting", { hidden: true, "aria-label": say.title }, h("div.row", h("h2", say.title)), h("p.help", say.help),
       h("div.row", h("label.check", this.color, h("span", say.color)), this.size.element, this.undo),
-      h("div.row", button(say.download, () => this.download()), button(say.use, () => this.file.click()), this.file, h("span.spring"), h("div.row", this.back, this.apply)), this.wrong, this.submission.card.element);
+      h("div.row", button(say.download, () => this.download()), button(say.use, () => this.file.click()), this.file, h("span.spring"), h("div.row", this.back, this.apply)), this.wrong, this.submission.element);
     stage.tools.querySelector(".buttons")?.prepend(this.button);
     stage.element.append(this.element);
     leaving.addEventListener("abort", () => this.submission.end());
@@ -144,7 +144,7 @@ export class PaintPanel {
     tell(this.wrong, "");
     this.apply.disabled = this.back.disabled = true;
     submission.restart();
-    submission.card.element.hidden = false;
+    submission.element.hidden = false;
     try {
       const painted = new File([await this.layer.png()], "painted.png", { type: "image/png" });
       const { scene: [scene], ...sent } = await submission.send({ ...(await base.files()), painted: [painted] });
@@ -156,7 +156,7 @@ export class PaintPanel {
     } catch (error) {
       if (!this.leaving.aborted && !submission.stopped) tell(this.wrong, messageOf(error));
     } finally {
-      submission.card.element.hidden = true;
+      submission.element.hidden = true;
       this.back.disabled = false;
       this.changed();
     }

@@ -19,7 +19,7 @@ const QUALITY = 0.95;
  * @param {Frame} frame part of the turned image
  * @param {number} [scale]
  */
-export function turnedAndCropped(image, turns, [left, top, right, bottom], scale = 1) {
+function turnedAndCropped(image, turns, [left, top, right, bottom], scale = 1) {
   const [width, height] = turns % 2 ? [image.height, image.width] : [image.width, image.height];
   const canvas = h("canvas", { width: Math.max(1, Math.round((right - left) * width * scale)), height: Math.max(1, Math.round((bottom - top) * height * scale)) });
   const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", { colorSpace: "srgb" }));

@@ -5,11 +5,9 @@ import { announce, h, messageOf, tell } from "./dom.js";
 import { plainly } from "./options.js";
 import { StoredFile } from "./stored.js";
 
-/** @typedef {import("./slots.js").Slot} Slot */
-
 export class Refusals {
   /**
-   * @param {Record<string, Slot>} slots by role
+   * @param {Record<string, import("./slots.js").Slot>} slots by role
    * @param {import("./options_part.js").OptionsPart} options
    * @param {import("./regions.js").RegionList} regions
    */

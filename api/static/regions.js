@@ -156,19 +156,9 @@ export class RegionList {
     }
   }
 
-  /** Remove masks, which belong to another scene. */
-  dropMasks() {
-    for (const row of this.rows) row.setMask(null);
-  }
-
-  /** Return the regions for `restore`. */
+  /** Return the regions with their masks, for `Row.set`. */
   kept() {
     return this.rows.map((row) => ({ ...row.value(), mask: row.mask() }));
-  }
-
-  /** @param {any[]} regions */
-  restore(regions) {
-    for (const region of regions) this.add().set(region);
   }
 
   clearWrong() {

@@ -6,15 +6,13 @@ import { shapeAround, ShapeTool } from "./shapes.js";
 import { Selection } from "./viewer/selection.js";
 import { words } from "./words.js";
 
-/** @typedef {import("./stage.js").Stage} Stage */
-/** @typedef {import("./viewer/selection.js").Changed} Changed */
 /** @typedef {{bits: Uint8Array, total: number}} Mask `bits`: one for each Gaussian, the lowest bit first; `total`: number of selected ones */
 /** @typedef {"move" | "brush" | "lasso" | "box" | "sphere" | "similar"} Tool */
 
 const say = words.select;
 
 export class SelectPanel {
-  /** @param {Stage} stage */
+  /** @param {import("./stage.js").Stage} stage */
   constructor(stage) {
     this.stage = stage;
     this.leaving = new AbortController();
@@ -60,7 +58,6 @@ export class SelectPanel {
     this.parts.through = check(say.through);
     this.parts.connected = check(say.connected, true);
     this.parts.connected.input.addEventListener("change", () => this.similarAgain());
-    this.parts.numbers = this.shapes.numbers;
     this.parts.toolHelp = h("p.help");
     this.parts.middle = button(say.atMiddle, () => this.similarAtMiddle());
     this.parts.apply = button(say.apply, () => this.shapes.shape && this.ask(...this.shapes.request(this.mode)));
@@ -68,12 +65,11 @@ export class SelectPanel {
     this.parts.redo = button(say.redo, () => this.ask("redo"));
     this.parts.modeRadios = radios(say.mode, say.modes, (mode) => (this.mode = mode));
     this.parts.toolRadios = radios(say.tool, say.tools, (tool) => this.choose(tool));
-    put(this.element = h("section.selecting", { hidden: true }), h("div.row", this.parts.title, this.counted),
+    this.element = h("section.selecting", { hidden: true, "aria-label": say.name }, h("div.row", this.parts.title, this.counted),
       h("div.row", this.parts.toolRadios, this.parts.modeRadios), this.parts.toolHelp,
-      h("div.row", this.parts.radius.element, this.parts.through.element, this.parts.tolerance.element, this.parts.connected.element, this.parts.middle, this.parts.numbers, this.parts.apply),
+      h("div.row", this.parts.radius.element, this.parts.through.element, this.parts.tolerance.element, this.parts.connected.element, this.parts.middle, this.shapes.numbers, this.parts.apply),
       h("div.row", this.parts.undo, this.parts.redo, button(say.invert, () => this.ask("invert")), button(say.clear, () => this.ask("clear")),
         h("span.spring"), button(say.cancel, () => this.close(null)), button(say.done, () => this.done(), "primary")));
-    this.element.setAttribute("aria-label", say.name);
     this.choose("move");
   }
 
@@ -151,13 +147,13 @@ export class SelectPanel {
     this.parts.radius.element.hidden = tool !== "brush";
     this.parts.through.element.hidden = !drawing;
     for (const part of [this.parts.tolerance.element, this.parts.connected.element, this.parts.middle]) part.hidden = tool !== "similar";
-    for (const part of [this.parts.numbers, this.parts.apply]) part.hidden = !shaped;
+    for (const part of [this.shapes.numbers, this.parts.apply]) part.hidden = !shaped;
     this.seed = undefined;
     this.shapes.show((tool === "box" || tool === "sphere") && this.scene?.middle ? shapeAround(tool, this.scene.middle) : null);
     this.paint();
   }
 
-  /** @param {Changed} changed */
+  /** @param {import("./viewer/selection.js").Changed} changed */
   changed({ total, past, future }) {
     if (!this.selection) return;
     this.total = total;

@@ -1,6 +1,7 @@
 // @ts-check
 /** Files of a new job: chosen or dropped, sorted by their names, checked as far as the page can, and listed. */
-import { h, icon, messageOf, newId, put } from "./dom.js";
+import { h, messageOf, newId, put } from "./dom.js";
+import { tool } from "./fields.js";
 import { showWrong } from "./options.js";
 import { editPainting } from "./painting_editor.js";
 import { contentOf, StoredFile } from "./stored.js";
@@ -15,7 +16,7 @@ const HEIC = /\.(heic|heif|hif)$/i;
 const SHOWN = 12;
 
 /** Add files to others; a file replaces one of the same name. @param {Chosen[]} old @param {Chosen[]} more */
-export function withoutDoubles(old, more) {
+function withoutDoubles(old, more) {
   const names = new Set(more.map(({ name }) => name));
   return [...old.filter(({ name }) => !names.has(name)), ...more];
 }
@@ -162,9 +163,10 @@ export class Slot {
 
   /** @param {Chosen} file */
   thumb(file) {
-    const remove = h("button.tool", { type: "button", "aria-label": say.remove(file.name), title: say.remove(file.name), onclick: () => this.remove(file) }, icon("close"));
+    const remove = tool("close", say.remove(file.name), () => this.remove(file));
     if (!this.pictures) return h("div.thumb.plain", h("span", file.name), remove);
-    const name = words.painting.edit(file.name), edit = h("button.tool.edit", { type: "button", "aria-label": name, title: name, onclick: () => this.edit(file) }, icon("crop"));
+    const edit = tool("crop", words.painting.edit(file.name), () => this.edit(file));
+    edit.classList.add("edit");
     const url = file instanceof StoredFile ? file.url : URL.createObjectURL(file);
     this.urls.push(url);
     return h("div.thumb", h("img", { src: url, alt: file.name }), edit, remove, this.notes[file.name] && h("small", this.notes[file.name]));
@@ -255,7 +257,7 @@ export function listenToDrops(take, signal) {
 }
 
 /** Return whether a file may hold cameras, by its name. @param {string} name */
-export const namesCameras = (name) => /\.json$/i.test(name) || MODEL.test(name);
+const namesCameras = (name) => /\.json$/i.test(name) || MODEL.test(name);
 
 /** @param {File} file @returns {Promise<string>} "" if nothing is wrong */
 export async function imageProblem(file) {

@@ -2,6 +2,7 @@
 /** 3D view with its controls: wipe, cameras, screenshots and messages. */
 import { announce, h, icon, messageOf, newId, put, tell } from "./dom.js";
 import { cameraLines, frameSize, upOf } from "./cameras.js";
+import { radios, tool } from "./fields.js";
 import { fileName } from "./names.js";
 import { Controls } from "./viewer/controls.js";
 import { canShow, Headset } from "./viewer/headset.js";
@@ -11,7 +12,6 @@ import { words } from "./words.js";
 
 /** @typedef {import("./cameras.js").JobCamera} JobCamera */
 /** @typedef {import("./viewer/viewer.js").Side} Side */
-/** @typedef {import("./viewer/splat_scene.js").SplatScene} SplatScene */
 
 const say = words.viewer;
 
@@ -67,27 +67,31 @@ export class Stage {
       this.drawFrames();
     }
     this.divider.addEventListener("wheel", (/** @type {WheelEvent} */ event) => this.controls?.wheel(event), { passive: false });
-    this.divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => event.buttons && this.wipeTo(event.clientX));
+    this.divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => {
+      const { left, width } = this.canvas.getBoundingClientRect();
+      if (event.buttons) this.setWipe(Math.max(0, Math.min(1, (event.clientX - left) / width)));
+    });
     this.divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => this.divider.setPointerCapture(event.pointerId));
   }
 
   makeTools() {
-    const button = (/** @type {any} */ picture, /** @type {string} */ name, /** @type {() => void} */ onclick) => h("button.tool", { type: "button", title: name, "aria-label": name, onclick }, icon(picture));
     const wipeId = newId();
     this.slider = h("input", { type: "range", id: wipeId, min: 0, max: 1000, step: 1, value: 500, oninput: () => this.setWipe(Number(this.slider.value) / 1000) });
-    this.wipe = h("div.wipe", { hidden: true }, h("label", { htmlFor: wipeId }, say.wipe), this.slider, button("swap", say.toggle, () => this.toggle()));
-    const group = newId(), mode = (/** @type {string} */ name, /** @type {boolean} */ orbit) =>
-      h("label", h("input", { type: "radio", name: group, checked: orbit, onchange: () => this.controls && this.setMode(orbit) }), h("span", name));
-    this.framesButton = h("button.tool", { type: "button", hidden: true, "aria-pressed": "true", title: say.frames, "aria-label": say.frames, onclick: () => this.toggleFrames() }, icon("cameras"));
+    this.wipe = h("div.wipe", { hidden: true }, h("label", { htmlFor: wipeId }, say.wipe), this.slider, tool("swap", say.toggle, () => this.toggle()));
+    const modes = radios(say.movement, { orbit: say.orbit, fly: say.fly }, (mode) => {
+      if (this.controls) this.controls.motion.orbit = mode === "orbit"; // otherwise about the eye
+      this.setHelp();
+    });
+    this.framesButton = tool("cameras", say.frames, () => this.toggleFrames(), { hidden: true, "aria-pressed": "true" });
     this.chooser = h("select", { "aria-label": say.camera, onchange: () => this.stand(Number(this.chooser.value)) });
     this.cameraTools = h("div.cameras", { hidden: true },
-      button("left", say.previous, () => this.stand(this.stood - 1)), this.chooser, button("right", say.next, () => this.stand(this.stood + 1)));
+      tool("left", say.previous, () => this.stand(this.stood - 1)), this.chooser, tool("right", say.next, () => this.stand(this.stood + 1)));
     this.helpList = h("dl");
     const help = h("details.help", h("summary", { title: say.keys, "aria-label": say.keys }, icon("help")), this.helpList);
     this.setHelp();
     help.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && help.open && (event.stopPropagation(), (help.open = false)));
-    put(this.tools, this.wipe, this.cameraTools, h("fieldset.segments", h("legend.away", say.movement), mode(say.orbit, true), mode(say.fly, false)),
-      h("div.buttons", this.framesButton, button("home", say.home, () => this.home()), button("picture", say.screenshot, () => this.save()), button("full", say.full, () => this.full()), help));
+    put(this.tools, this.wipe, this.cameraTools, modes,
+      h("div.buttons", this.framesButton, tool("home", say.home, () => this.home()), tool("picture", say.screenshot, () => this.save()), tool("full", say.full, () => this.full()), help));
     this.offerHeadsets();
   }
 
@@ -115,12 +119,6 @@ export class Stage {
     } catch (error) {
       this.message(messageOf(error));
     }
-  }
-
-  /** @param {boolean} orbit whether to rotate about the scene; otherwise about the eye */
-  setMode(orbit) {
-    if (this.controls) this.controls.motion.orbit = orbit;
-    this.setHelp();
   }
 
   /** Show the keys of the mode, and those of another part. @param {string[][]} [others] */
@@ -180,12 +178,6 @@ export class Stage {
     this.divider.style.left = `${share * 100}%`;
     this.leftName.classList.toggle("gone", share < 0.08);
     this.rightName.classList.toggle("gone", share > 0.92);
-  }
-
-  /** @param {number} x x of the pointer in the window */
-  wipeTo(x) {
-    const { left, width } = this.canvas.getBoundingClientRect();
-    this.setWipe(Math.max(0, Math.min(1, (x - left) / width)));
   }
 
   toggle() {

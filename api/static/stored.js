@@ -49,7 +49,7 @@ export function storedInputs(job) {
  * @param {any} job
  * @returns {Promise<Record<string, StoredFile[]>>}
  */
-export async function allInputs(job) {
+async function allInputs(job) {
   if (!job.input_counts.photos && !job.input_counts.mask) return storedInputs(job);
   const inputs = [];
   for (let cursor = "0"; cursor !== null; ) {

@@ -22,8 +22,6 @@ import { upQuestion } from "./upright.js";
 import { ScenePart, ViewsPart } from "./views_part.js";
 import { words } from "./words.js";
 
-/** @typedef {import("./stored.js").Chosen} Chosen */
-
 const say = words.submit;
 
 /** View of a new job. When it ends, its uploads stop: other views have no place to show them. */
@@ -45,7 +43,7 @@ export class SubmitView {
     this.created = "";
     /** Request that the service has not answered yet. @type {false | "planning" | "starting"} */
     this.busy = false;
-    /** Scene that the masks of the regions belong to. @type {Chosen | undefined} */
+    /** Scene that the masks of the regions belong to. @type {import("./stored.js").Chosen | undefined} */
     this.shown = undefined;
     /** Name of the scene of the earlier job that the form started from. */
     this.earlier = this.draft?.again ? this.draft.files.scene[0]?.name : undefined;
@@ -89,7 +87,7 @@ export class SubmitView {
       this.views.element,
       h("section", h("h2", say.essentials), options.presets, options.main),
       h("section", h("h2", say.more), h("div", options.lookFold, this.regionFold, options.expertFold)),
-      h("div.actions", this.refusals.element, submission.card.element, h("div.row", this.costButton, this.startButton)), this.result);
+      h("div.actions", this.refusals.element, submission.element, h("div.row", this.costButton, this.startButton)), this.result);
     this.element = h("div.split", h("div.pinned", this.stage.element), this.form);
     this.views.show();
     this.unfinished.show();
@@ -101,7 +99,7 @@ export class SubmitView {
     this.paintings.restore(draft);
     for (const [role, slot] of Object.entries(this.slots)) slot.add(draft.files[role]);
     regions.earlier = draft.files.mask ?? [];
-    regions.restore(draft.regions);
+    for (const region of draft.regions) regions.add().set(region);
     this.regionFold.open = draft.regions.length > 0;
     for (const [all, ask] of /** @type {const} */ ([[draft.expired, say.expired], [draft.lost ?? {}, say.lost]]))
       for (const [role, names] of Object.entries(all)) if (names.length) this.slots[/** @type {keyof typeof this.slots} */ (role)]?.askAgain(names, ask);
@@ -157,7 +155,7 @@ export class SubmitView {
     this.crop.close();
     this.paint.cancel();
     this.paint.button.hidden = !file;
-    if (file !== this.shown) this.regions.dropMasks();
+    if (file !== this.shown) for (const row of this.regions.rows) row.setMask(null); // those of another scene
     this.shown = file;
     if (file && this.earlier && file.name !== this.earlier) this.leaveEarlier();
     for (const offer of [this.invite, this.example.element]) offer.hidden = !!file;
@@ -288,7 +286,7 @@ export class SubmitView {
     this.busy = busy;
     [this.costButton.disabled, this.startButton.disabled] = [!!busy, busy === "starting"];
     this.nameStart();
-    this.submission.card.element.hidden = !busy;
+    this.submission.element.hidden = !busy;
     if (busy) put(this.result);
   }
 
@@ -296,23 +294,29 @@ export class SubmitView {
   showPlan(plan) {
     if (!plan || this.busy === "starting") return;
     const { jobs } = this.paintings;
-    if (plan.up) this.views.showPlanned(plan.up.direction, plan.views);
+    if (plan.up) {
+      this.views.planned = plan.views;
+      this.views.showUp(plan.up.direction);
+    }
     if (plan.up?.sure === false) return this.askUp(plan.up.candidates, true);
-    put(this.result, costCard(plan, this.options.controls.has("within") ? () => (this.options.useBudget(), this.act(true)) : null), jobs > 1 ? h("p.help", say.eachTakes(jobs)) : null);
-    this.result.scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
+    this.answer(costCard(plan, this.options.controls.has("within") ? () => (this.options.useBudget(), this.act(true)) : null), jobs > 1 ? h("p.help", say.eachTakes(jobs)) : null);
   }
 
   /** Ask which way is up, and then continue. @param {string[]} candidates @param {boolean} dry whether to plan only */
   askUp(candidates, dry) {
-    put(this.result, upQuestion(this.stage, candidates, (up) => (this.views.standUp(up), this.act(dry))));
-    this.result.scrollIntoView({ block: "nearest" });
+    this.answer(upQuestion(this.stage, candidates, (up) => (this.views.standUp(up), this.act(dry))));
   }
 
   /** Ask whether to start although the cameras hardly show the scene. @param {string} why */
   askCameras(why) {
     this.slots.cameras.wrong(why);
-    put(this.result, h("section.card", { role: "alert" }, h("h2", say.foreign), h("p", why),
+    this.answer(h("section.card", { role: "alert" }, h("h2", say.foreign), h("p", why),
       h("div.row", button(say.around, () => this.views.around.input.click(), "primary"), button(say.anyway, () => this.act(false, false)))));
+  }
+
+  /** Show what the service has answered. @param {...(HTMLElement | null)} elements */
+  answer(...elements) {
+    put(this.result, ...elements);
     this.result.scrollIntoView({ block: "nearest" });
   }
 
@@ -334,7 +338,7 @@ export class SubmitView {
   refuse(error) {
     if (error instanceof Problem && error.code === "unsure-up") return this.askUp(error.body.candidates, false);
     if (error instanceof Problem && error.code === "unsure-cameras") return this.askCameras(error.message);
-    if (error instanceof Problem && error.code === "unknown-upload") this.submission.card.uploads.clear();
+    if (error instanceof Problem && error.code === "unknown-upload") this.submission.uploads.clear();
     this.refusals.show(error);
   }
 

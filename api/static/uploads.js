@@ -1,6 +1,6 @@
 // @ts-check
 /**
- * Uploads in parts (tus 1.0). Parts that have arrived are not sent again after a pause, a lost connection or a reload.
+ * Uploads in parts (tus 1.0). Parts that have arrived are not sent again after a stop, a lost connection or a reload.
  */
 import { ask, Problem, Unreachable } from "./api.js";
 import { words } from "./words.js";
@@ -8,13 +8,13 @@ import { words } from "./words.js";
 const TUS = { "Tus-Resumable": "1.0.0" };
 const KEPT = "sgsst.uploads", MOST_KEPT = 60;
 const SMALLEST = 1 << 20, LARGEST = 1 << 26;
-/** Most milliseconds between attempts while there is no connection. */
-const AGAIN = 2000;
+/** Milliseconds between attempts while there is no connection. */
+const AGAIN = 1000;
 /** Target duration of a part in milliseconds. */
 const PART = 1500;
 const SAMPLES = 64, SAMPLE = 4096;
 
-/** @typedef {"waiting" | "sending" | "paused" | "offline" | "done"} State */
+/** @typedef {"waiting" | "sending" | "offline" | "done"} State */
 /** @typedef {{id: string, name: string, size: number, sent: number}} Kept */
 
 /** @typedef {"localStorage" | "sessionStorage"} Place `sessionStorage` is that of this tab */
@@ -84,13 +84,9 @@ export class Upload {
     /** @type {State} */
     this.state = "waiting";
     this.id = "";
-    /** Whether the service already had the file, so that nothing was sent. */
-    this.known = false;
     this.part = SMALLEST;
     /** @type {AbortController | null} */
     this.sending = null;
-    /** @type {(() => void) | null} */
-    this.goOn = null;
     this.over = false;
   }
 
@@ -100,69 +96,34 @@ export class Upload {
     this.told();
   }
 
-  pause() {
-    if (this.state === "done") return;
-    this.enter("paused");
-    this.sending?.abort();
-  }
-
-  resume() {
-    if (this.state !== "paused") return;
-    this.enter("waiting");
-    this.goOn?.();
-  }
-
   /** Stop the upload; parts that have arrived remain for a later attempt. */
   stop() {
     this.over = true;
     this.sending?.abort();
-    this.goOn?.();
   }
 
-  /** Send the missing parts. @returns {Promise<string>} the upload's id */
+  /** Send the missing parts. @throws {DOMException} if it was stopped */
   async run() {
     this.print = await fingerprint(this.file);
-    const before = kept()[this.print];
-    if (before) this.id = before.id;
-    let wait = AGAIN / 4;
-    for (;;) {
+    this.id = kept()[this.print]?.id ?? this.id;
+    while (!this.over) {
       try {
-        if (this.over) throw new DOMException("", "AbortError");
-        await this.unpaused();
         await this.findOffset();
-        this.known = this.sent === this.file.size && this.part === SMALLEST && !this.sending;
-        while (this.sent < this.file.size && this.state !== "paused") {
-          await this.sendPart();
-          wait = AGAIN / 4;
-        }
-        if (this.state === "paused") continue;
-        this.enter("done");
-        return this.id;
+        while (this.sent < this.file.size && !this.over) await this.sendPart();
+        if (!this.over) return this.enter("done");
       } catch (error) {
         if (!this.canGoOn(error)) throw error;
-        if (/** @type {State} */ (this.state) === "paused") continue;
         this.enter("offline");
-        await this.waited(wait);
-        wait = Math.min(wait * 2, AGAIN);
+        await new Promise((done) => setTimeout(done, AGAIN));
       }
     }
-  }
-
-  /** Wait for this time, or until the browser is online again or the user acts. @param {number} wait milliseconds */
-  async waited(wait) {
-    const back = new AbortController();
-    await new Promise((done) => {
-      this.goOn = () => done(null);
-      setTimeout(done, wait);
-      addEventListener("online", done, { signal: back.signal });
-    });
-    back.abort();
+    throw new DOMException("", "AbortError");
   }
 
   /** @param {unknown} error */
   canGoOn(error) {
     if (this.over) return false;
-    if (error instanceof Unreachable || this.state === "paused") return true;
+    if (error instanceof Unreachable) return true;
     if (!(error instanceof Problem)) return false;
     if (error.status === 404) this.forget();
     return [404, 408, 409, 423, 429, 460, 500, 502, 503, 504].includes(error.status);
@@ -174,10 +135,6 @@ export class Upload {
     this.sent = 0;
   }
 
-  async unpaused() {
-    while (this.state === "paused" && !this.over) await new Promise((done) => (this.goOn = () => done(null)));
-  }
-
   /** Find the offset from which to resume, or create an upload if there is none. */
   async findOffset() {
     const { file } = this;
@@ -185,8 +142,7 @@ export class Upload {
       try {
         const answer = await ask("HEAD", `v1/uploads/${this.id}`, { headers: TUS });
         if (Number(answer.headers.get("Upload-Length")) !== file.size) throw new Problem(404, null);
-        this.arrived(Number(answer.headers.get("Upload-Offset")));
-        return;
+        return this.arrived(Number(answer.headers.get("Upload-Offset")));
       } catch (error) {
         if (!(error instanceof Problem) || error.status !== 404) throw error;
         this.forget();
@@ -202,8 +158,7 @@ export class Upload {
   arrived(sent) {
     this.sent = sent;
     if (this.print) keep(this.print, { id: this.id, name: this.file.name, size: this.file.size, sent });
-    if (this.state !== "paused") this.enter("sending");
-    else this.told();
+    this.enter("sending");
   }
 
   async sendPart() {
@@ -218,20 +173,14 @@ export class Upload {
   }
 }
 
-/**
- * Send files, some of them concurrently.
- *
- * @param {Upload[]} uploads
- * @returns {Promise<string[]>} ids, in the order of `uploads`
- */
-export async function sendAll(uploads, together = 3) {
-  const ids = /** @type {string[]} */ (new Array(uploads.length)), waiting = uploads.map((_, i) => i);
+/** Send files, three of them concurrently. @param {Upload[]} uploads */
+export async function sendAll(uploads) {
+  const waiting = [...uploads];
   const work = async () => {
-    for (let next = waiting.shift(); next !== undefined; next = waiting.shift()) ids[next] = await uploads[next].run();
+    for (let next = waiting.shift(); next; next = waiting.shift()) await next.run();
   };
-  await Promise.all(Array.from({ length: Math.min(together, uploads.length) }, work));
-  return ids;
+  await Promise.all([work(), work(), work()]);
 }
 
 /** @param {Upload} upload */
-export const uploadText = (upload) => words.uploads[upload.state](upload.sent / Math.max(upload.file.size, 1), upload.known);
+export const uploadText = ({ state, sent, file }) => (state === "done" ? "" : words.uploads[state](sent / Math.max(file.size, 1)));

@@ -1,11 +1,12 @@
 // @ts-check
 /** The up direction of a scene: buttons that turn one which lies on its side, and a question with an image for each answer. */
-import { h, icon } from "./dom.js";
-import { button } from "./fields.js";
+import { h } from "./dom.js";
+import { button, tool } from "./fields.js";
 import { cross, dot, times } from "./viewer/vectors.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./viewer/vectors.js").Vector} Vector */
+/** @typedef {import("./stage.js").Stage} Stage */
 
 const say = words.upright;
 /** Directions that the option `up` offers. */
@@ -26,7 +27,7 @@ export const upName = (up) => Object.keys(UPS).find((name) => dot(UPS[name], up)
  * @param {Vector} up up direction before
  * @param {Vector} wanted direction that becomes up, as nearly as the axes allow
  */
-export function turnedUp(up, wanted) {
+function turnedUp(up, wanted) {
   const across = Object.entries(UPS).filter(([, axis]) => Math.abs(dot(axis, up)) < 0.5);
   return across.reduce((best, each) => (dot(each[1], wanted) > dot(best[1], wanted) ? each : best))[0];
 }
@@ -34,23 +35,18 @@ export function turnedUp(up, wanted) {
 /**
  * Create the buttons.
  *
- * @param {import("./stage.js").Stage} stage
+ * @param {Stage} stage
  * @param {(up: string, front: Vector) => void} choose receives the value of the option `up`, and the direction from
  *   which to look then
  */
 export function uprightButtons(stage, choose) {
-  const button = (/** @type {"turn" | "tip"} */ name, /** @type {(up: Vector, ahead: Vector) => [Vector, Vector]} */ turned) => h("button.tool", {
-    type: "button", title: say[name], "aria-label": say[name], onclick: () => {
-      if (!stage.viewer?.sides) return;
-      const { up, axes: [, , forward] } = stage.viewer.camera, [wanted, front] = turned(up, UPS[turnedUp(up, forward)]);
-      choose(turnedUp(up, wanted), front);
-    },
-  }, icon(name));
-  return h("div.upright", button("turn", (up, ahead) => [cross(up, ahead), times(ahead, -1)]), button("tip", (up, ahead) => [ahead, up]));
+  const turning = (/** @type {"turn" | "tip"} */ name, /** @type {(up: Vector, ahead: Vector) => [Vector, Vector]} */ turned) => tool(name, say[name], () => {
+    if (!stage.viewer?.sides) return;
+    const { up, axes: [, , forward] } = stage.viewer.camera, [wanted, front] = turned(up, UPS[turnedUp(up, forward)]);
+    choose(turnedUp(up, wanted), front);
+  });
+  return h("div.upright", turning("turn", (up, ahead) => [cross(up, ahead), times(ahead, -1)]), turning("tip", (up, ahead) => [ahead, up]));
 }
-
-/** @typedef {import("./stage.js").Stage} Stage */
-
 
 /**
  * Create the question.

@@ -2,6 +2,7 @@
 /** Viewpoints of a result: a list of buttons, a path through them, and for the maker of the result, their choice. */
 import { ask } from "./api.js";
 import { announce, h, icon, messageOf, put } from "./dom.js";
+import { tool } from "./fields.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./cameras.js").JobCamera} JobCamera */
@@ -47,7 +48,7 @@ export class ViewpointsPanel {
     stage.start = start;
     put(this.element, this.list, this.path, changes && [this.form, this.note]);
     put(this.list, named.map((viewpoint, i) => h("li", h("button.quiet.small", { type: "button", "aria-keyshortcuts": i < 9 ? String(i + 1) : null, onclick: () => this.go(i) }, `${i + 1} · ${viewpoint.name}`),
-      changes && h("button.tool", { type: "button", title: say.remove(viewpoint.name), "aria-label": say.remove(viewpoint.name), onclick: () => this.save({ start, named: named.filter((each) => each !== viewpoint) }, say.removed) }, icon("close")))));
+      changes && tool("close", say.remove(viewpoint.name), () => this.save({ start, named: named.filter((each) => each !== viewpoint) }, say.removed)))));
     this.list.hidden = !named.length;
     this.path.hidden = named.length < 2;
     this.unstart.hidden = !start;

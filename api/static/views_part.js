@@ -64,12 +64,6 @@ export class ViewsPart {
     this.showUp(up, front);
   }
 
-  /** Show the orbit that the service has planned. @param {string} up @param {number} views */
-  showPlanned(up, views) {
-    this.planned = views;
-    this.showUp(up);
-  }
-
   /** Turn the scene and its orbit to an up direction. @param {string} up @param {number[]} [front] see `Viewer.frame` */
   showUp(up, front) {
     this.stage.standUp(directionOf(up) ?? UPS["-y"], front);

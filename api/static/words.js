@@ -181,9 +181,7 @@ export const words = {
     defaults: /** @type {Record<string, string>} */ ({ content_weight: "strong", orbit: "auto", radius: "automatic", retention_days: "as long as the service does" }),
   },
   uploads: {
-    waiting: () => "waiting", paused: (/** @type {number} */ share) => `paused at ${percent(share)}`, offline: (/** @type {number} */ share) => `no connection; ${percent(share)} uploaded`,
-    sending: (/** @type {number} */ share) => percent(share), done: (/** @type {number} */ _, /** @type {boolean} */ known) => (known ? "already uploaded" : "uploaded"),
-    pause: "Pause", resume: "Resume", title: "Uploading",
+    title: "Uploading", waiting: () => "waiting", sending: (/** @type {number} */ share) => percent(share), offline: (/** @type {number} */ share) => `no connection; ${percent(share)} uploaded`,
   },
   plan: {
     title: "Estimate", decided: "How it will run", ran: "How it ran", seconds: "Estimated time", wholeJob: "for the whole job, once it starts", memory: "Memory", gpuMemory: "GPU memory", workers: "Workers", gaussians: "Gaussians", views: "Views",
@@ -215,7 +213,7 @@ export const words = {
     unplayable: "This browser can't play H.264 video. Download it instead.",
   },
   chart: {
-    seconds: "seconds of steps", loss: "loss", all: "mean of all views", single: "single views", coarse: "coarse", scale: (/** @type {number} */ n) => (n ? `1/${2 ** n}` : "full size"),
+    seconds: "seconds of steps", loss: "loss", all: "mean of all views", single: "single views", coarse: "coarse",
     told: (/** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ s) => `Loss over time: from ${three.format(from)} to ${three.format(to)} in ${seconds(s)}`,
   },
   jobs: {

@@ -4,7 +4,6 @@ import { cross, difference, dot, rotated, sum, times, unit } from "./vectors.js"
 
 /** @typedef {import("./vectors.js").Vector} Vector */
 /** @typedef {import("../cameras.js").JobCamera} JobCamera */
-/** @typedef {import("../cameras.js").RestCamera} RestCamera */
 
 /** Focal length of a free view as a multiple of its height: 50 degrees. */
 const FOCAL = 1.07;
@@ -113,7 +112,7 @@ export class ViewCamera {
    * Return the camera of a canvas's image, as jobs take it.
    *
    * @param {number[]} size width and height in pixels
-   * @returns {RestCamera}
+   * @returns {import("../cameras.js").RestCamera}
    */
   ofImage([width, height]) {
     const [fx, fy] = this.pixels(width, height);

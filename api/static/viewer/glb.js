@@ -11,8 +11,6 @@ import { extrasRendering } from "./render_tag.js";
 import { words } from "../words.js";
 
 /** @typedef {import("./vectors.js").Vector} Vector */
-/** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
-/** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
 const EXTENSION = "KHR_gaussian_splatting", MAX_JSON = 1 << 20, MAX_DEPTH = 64;
 /** Readers of component types: method of a DataView, bytes, and the integer that stands for 1 if integers are normalized. */
@@ -26,7 +24,7 @@ const Y_UP = [[-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]];
 /** Maximum deviation of a node's matrix from a rotation, relative to its scale. */
 const TOLERANCE = 1e-4;
 
-/** @param {ByteReader} reader @returns {Promise<SceneFile>} */
+/** @param {import("./byte_reader.js").ByteReader} reader @returns {Promise<import("./scene_file.js").SceneFile>} */
 export async function glb(reader) {
   const head = new DataView((await reader.take(20)).buffer), size = head.getUint32(12, true);
   if (head.getUint32(4, true) !== 2 || size > MAX_JSON) throw new SceneError();
@@ -39,18 +37,36 @@ export async function glb(reader) {
   let current = 0, first = 0; // batches are read in order
   return unpacked(count, degree, async (begin, into, width, some) => {
     data ??= new DataView((await reader.take(bytes)).buffer);
-    for (let i = 0; i < some; i++) {
-      while (begin + i >= first + parts[current].count) first += parts[current++].count;
-      unpack(data, parts[current], begin + i - first, into, i * width, coefficients);
+    for (let i = begin, o = 0; i < begin + some; i++, o += width) {
+      while (i >= first + parts[current].count) first += parts[current++].count;
+      const { readers, scale: larger, axes, moved, turn: [a, b, c, d], harmonics: rotated } = parts[current], row = i - first;
+      const [position, rotation, scale, opacity, color, ...harmonics] = readers.map((read) => (/** @type {number} */ part) => read(/** @type {DataView} */ (data), row, part));
+      const at = [position(0), position(1), position(2)], [x, y, z, w] = [rotation(0), rotation(1), rotation(2), rotation(3)];
+      for (let axis = 0; axis < 3; axis++) {
+        into[o + axis] = larger * dot(axes[axis], at) + moved[axis];
+        into[o + SCALES + axis] = Math.log(larger * scale(axis));
+        into[o + COLOR + axis] = color(axis);
+      }
+      const alpha = Math.min(Math.max(opacity(0), 1e-7), 1 - 1e-7);
+      into[o + OPACITY] = Math.log(alpha / (1 - alpha));
+      into[o + ROTATION] = a * w - b * x - c * y - d * z;
+      into[o + ROTATION + 1] = a * x + b * w + c * z - d * y;
+      into[o + ROTATION + 2] = a * y - b * z + c * w + d * x;
+      into[o + ROTATION + 3] = a * z + b * y - c * x + d * w;
+      for (let n = 0; n < harmonics.length; n++) {
+        for (let channel = 0; channel < 3; channel++) {
+          into[o + HARMONICS + channel * coefficients + n] = rotated[n].reduce((sum, [before, factor]) => sum + factor * harmonics[before](channel), 0);
+        }
+      }
     }
   }, rendering);
 }
 
-/** @typedef {{offset: number, stride: number, value: (data: DataView, at: number, part: number) => number}} Place place of an attribute's values in the data; `value` reads a part of one */
+/** @typedef {(data: DataView, i: number, part: number) => number} Reader reads a part of the attribute of Gaussian i */
 
 /** @typedef {{scale: number, axes: Vector[], moved: Vector, turn: number[], harmonics: [number, number][][]}} Pose scale of a node, rows of its rotation, its translation, and the rotation as a quaternion (wxyz) and of harmonics */
 
-/** @typedef {Pose & {count: number, places: Place[]}} Part set of Gaussians: places of `NAMES`, then of harmonics */
+/** @typedef {Pose & {count: number, readers: Reader[]}} Part set of Gaussians: readers of `NAMES`, then of harmonics */
 
 /**
  * Return all sets of Gaussians, their largest SH degree and their render mode.
@@ -73,7 +89,7 @@ function partsOf(text, bytes) {
   const parts = used.flatMap((/** @type {any} */ { primitives, pose }) => primitives.map((/** @type {any} */ primitive) => ({ ...pose, ...partOf(primitive, accessors, bufferViews, bytes) })));
   const count = parts.reduce((sum, part) => sum + part.count, 0);
   if (!(count <= bytes)) throw new SceneError(words.scene.notShown("This kind of GLB"));
-  const degree = Math.max(...parts.map(({ places }) => Math.sqrt(places.length - NAMES.length + 1) - 1));
+  const degree = Math.max(...parts.map(({ readers }) => Math.sqrt(readers.length - NAMES.length + 1) - 1));
   return { parts, degree, rendering: extrasRendering(first.extras) };
 }
 
@@ -118,48 +134,16 @@ function partOf(primitive, accessors, bufferViews, bytes) {
     for (let i = 0; i < 2 * degree + 3; i++) names.push(`${EXTENSION}:SH_DEGREE_${degree + 1}_COEF_${i}`);
   }
   const count = Number(accessors[primitive.attributes.POSITION].count);
-  const places = names.map((name) => {
+  /** @type {Reader[]} */
+  const readers = names.map((name) => {
     const { bufferView, byteOffset = 0, componentType, type, normalized, sparse } = accessors[primitive.attributes[name]], view = bufferViews[bufferView];
     const [method, size, largest] = COMPONENTS[componentType] ?? ["getFloat32", NaN, 1];
     const stride = view.byteStride ?? size * TYPES[type], offset = (view.byteOffset ?? 0) + byteOffset;
     const inside = count > 0 && offset >= 0 && stride > 0 && offset + (count - 1) * stride + size * TYPES[type] <= bytes;
     if (sparse || !inside) throw new SceneError(words.scene.notShown("This kind of GLB"));
-    const read = (/** @type {DataView} */ data, /** @type {number} */ at, /** @type {number} */ part) => data[method](at + size * part, true);
-    return { offset, stride, value: normalized && largest > 1 ? (/** @type {DataView} */ data, /** @type {number} */ at, /** @type {number} */ part) => Math.max(read(data, at, part) / largest, -1) : read };
+    /** @type {Reader} */
+    const read = (data, i, part) => data[method](offset + i * stride + size * part, true);
+    return normalized && largest > 1 ? (data, i, part) => Math.max(read(data, i, part) / largest, -1) : read;
   });
-  return { count, places };
-}
-
-/**
- * @param {DataView} data
- * @param {Part} part
- * @param {number} i index of the Gaussian
- * @param {Float32Array} into
- * @param {number} o offset of its row
- * @param {number} coefficients number of harmonics per color channel in a row, which may be more than the part has
- */
-function unpack(data, { places, scale: larger, axes, moved, turn: [a, b, c, d], harmonics }, i, into, o, coefficients) {
-  const [position, rotation, scale, opacity, color] = places.map(({ offset, stride, value }) => (/** @type {number} */ axis) => value(data, offset + i * stride, axis));
-  const at = [position(0), position(1), position(2)], [x, y, z, w] = [rotation(0), rotation(1), rotation(2), rotation(3)];
-  for (let axis = 0; axis < 3; axis++) {
-    into[o + axis] = larger * dot(axes[axis], at) + moved[axis];
-    into[o + SCALES + axis] = Math.log(larger * scale(axis));
-    into[o + COLOR + axis] = color(axis);
-  }
-  const alpha = Math.min(Math.max(opacity(0), 1e-7), 1 - 1e-7);
-  into[o + OPACITY] = Math.log(alpha / (1 - alpha));
-  into[o + ROTATION] = a * w - b * x - c * y - d * z;
-  into[o + ROTATION + 1] = a * x + b * w + c * z - d * y;
-  into[o + ROTATION + 2] = a * y - b * z + c * w + d * x;
-  into[o + ROTATION + 3] = a * z + b * y - c * x + d * w;
-  for (let n = 0; n < places.length - NAMES.length; n++) {
-    for (let channel = 0; channel < 3; channel++) {
-      let sum = 0;
-      for (const [before, factor] of harmonics[n]) {
-        const { offset, stride, value } = places[NAMES.length + before];
-        sum += factor * value(data, offset + i * stride, channel);
-      }
-      into[o + HARMONICS + channel * coefficients + n] = sum;
-    }
-  }
+  return { count, readers };
 }

@@ -36,27 +36,10 @@ export function pack(values, width, at, stored, degree) {
     geometry: new Uint32Array(count * 8), colors: new Uint16Array(count * 3),
     harmonics: new Uint16Array(count * texels * 8), centers: new Float32Array(count * 3), reach: new Float32Array(count),
   };
-  packGeometry(packed, values, width, at, count);
-  const bits = new Uint32Array(values.buffer, values.byteOffset, values.length);
-  for (let i = 0, o = 0; i < count; i++, o += width) {
-    packed.colors[3 * i] = halfOf(bits[o + at.f_dc_0]);
-    packed.colors[3 * i + 1] = halfOf(bits[o + at.f_dc_1]);
-    packed.colors[3 * i + 2] = halfOf(bits[o + at.f_dc_2]);
-  }
-  if (degree) packHarmonics(packed.harmonics, bits, width, at, count, stored, degree);
-  return packed;
-}
-
-/**
- * @param {Packed} packed
- * @param {Float32Array} values
- * @param {number} width
- * @param {Record<string, number>} at
- * @param {number} count
- */
-function packGeometry({ geometry, centers, reach }, values, width, at, count) {
-  const floats = new Float32Array(geometry.buffer), { x, y, z, opacity, scale_0, scale_1, scale_2, rot_0, rot_1, rot_2, rot_3 } = at;
-  const step = 65535 / SCALE_RANGE;
+  const { geometry, colors, harmonics, centers, reach } = packed, floats = new Float32Array(geometry.buffer);
+  const bits = new Uint32Array(values.buffer, values.byteOffset, values.length), all = (stored + 1) ** 2 - 1, kept = (degree + 1) ** 2 - 1;
+  const places = Array.from({ length: kept * 3 }, (_, n) => at[`f_rest_${(n % 3) * all + Math.floor(n / 3)}`]), step = 65535 / SCALE_RANGE;
+  const { x, y, z, opacity, scale_0, scale_1, scale_2, rot_0, rot_1, rot_2, rot_3, f_dc_0, f_dc_1, f_dc_2 } = at;
   const scale = (/** @type {number} */ value) => Math.min(65535, Math.max(0, Math.round((value - SCALE_LOW) * step)));
   const part = (/** @type {number} */ value) => Math.round(value * 32767) & 0xffff;
   for (let i = 0, o = 0, g = 0; i < count; i++, o += width, g += 8) {
@@ -73,27 +56,13 @@ function packGeometry({ geometry, centers, reach }, values, width, at, count) {
     geometry[g + 6] = scale(s1) | (scale(s2) << 16);
     centers[3 * i] = px; centers[3 * i + 1] = py; centers[3 * i + 2] = pz;
     reach[i] = alpha < 257 ? -1 : 3.4 * Math.exp(Math.max(s0, s1, s2)); // below 1/255 nothing is drawn; sqrt(2 ln 255) = 3.33
+    colors[3 * i] = halfOf(bits[o + f_dc_0]);
+    colors[3 * i + 1] = halfOf(bits[o + f_dc_1]);
+    colors[3 * i + 2] = halfOf(bits[o + f_dc_2]);
+    for (let n = 0; n < places.length; n++) harmonics[i * texels * 8 + n] = halfOf(bits[o + places[n]]);
   }
+  return packed;
 }
-
-/**
- * @param {Uint16Array} harmonics
- * @param {Uint32Array} bits
- * @param {number} width
- * @param {Record<string, number>} at
- * @param {number} count
- * @param {number} stored
- * @param {number} degree
- */
-function packHarmonics(harmonics, bits, width, at, count, stored, degree) {
-  const kept = (degree + 1) ** 2 - 1, all = (stored + 1) ** 2 - 1, each = harmonicTexels(degree) * 8;
-  const places = Array.from({ length: kept * 3 }, (_, n) => at[`f_rest_${(n % 3) * all + Math.floor(n / 3)}`]);
-  for (let i = 0, o = 0, h = 0; i < count; i++, o += width, h += each) {
-    for (let n = 0; n < places.length; n++) harmonics[h + n] = halfOf(bits[o + places[n]]);
-  }
-}
-
-/** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
 export const SH_C0 = 0.28209479177387814;
 /** Values of a row that every scene has. */
@@ -116,7 +85,7 @@ const OTHERS = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];
  * @param {number} degree
  * @param {(begin: number, rows: Float32Array, width: number, count: number) => void | Promise<void>} unpack fills `count` rows
  * @param {import("./render_tag.js").Rendering} rendering
- * @returns {SceneFile}
+ * @returns {import("./scene_file.js").SceneFile}
  */
 export function unpacked(count, degree, unpack, rendering = CLASSIC) {
   const rest = ((degree + 1) ** 2 - 1) * 3, width = HARMONICS + rest;

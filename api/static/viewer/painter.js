@@ -3,7 +3,6 @@
 import { CLASSIC } from "./render_tag.js";
 import { lineFragment, lineVertex, overBackground, splatFragment, splatVertex, wholeVertex } from "./shaders.js";
 
-/** @typedef {import("./viewer.js").Viewer} Viewer */
 /** @typedef {import("./viewer.js").Side} Side */
 /** @typedef {import("./splat_scene.js").SplatScene} SplatScene */
 /** @typedef {(name: string) => WebGLUniformLocation | null} Locate returns where a uniform of a program is */
@@ -23,7 +22,7 @@ export class Painter {
   picture = null;
   pictureSize = [0, 0];
 
-  /** @param {Viewer} viewer */
+  /** @param {import("./viewer.js").Viewer} viewer */
   constructor(viewer) {
     this.viewer = viewer;
     this.gl = viewer.gl;

@@ -194,15 +194,24 @@ export function compressedPly(reader, { elements, comments }) {
     || chunk.count !== Math.ceil(vertex.count / CHUNK) || !(chunk.stride > 0) || !("packed_position" in vertex.columns)
     || (sh && (sh.name !== "sh" || sh.count !== vertex.count || sh.stride !== rest)) || !(rest in DEGREES);
   if (wrong) throw new SceneError(words.scene.notGaussians);
+  const order = ["packed_position", "packed_rotation", "packed_scale", "packed_color"].map((name) => vertex.columns[name].offset / 4);
   /** @type {{bounds: Float32Array, rows: Uint32Array} | null} */
   let read = null;
   return unpacked(vertex.count, DEGREES[rest], async (begin, into, width, count) => {
-    read ??= await chunksAndRows(reader, chunk, vertex);
-    const order = ["packed_position", "packed_rotation", "packed_scale", "packed_color"].map((name) => vertex.columns[name].offset / 4);
-    for (let i = 0; i < count; i++) unpackRow(read, begin + i, order, into, i * width);
-    if (!rest) return;
-    const bytes = await reader.take(count * rest);
-    for (let i = 0; i < count; i++) for (let n = 0; n < rest; n++) into[i * width + HARMONICS + n] = STEPS[bytes[i * rest + n]];
+    const { bounds, rows } = (read ??= await chunksAndRows(reader, chunk, vertex)), bytes = await reader.take(count * rest);
+    for (let i = 0, o = 0; i < count; i++, o += width) {
+      const [position, rotation, scale, color] = order.map((place) => rows[4 * (begin + i) + place]), b = 18 * Math.floor((begin + i) / CHUNK);
+      const between = (/** @type {number} */ part, /** @type {number} */ share) => bounds[b + 2 * part] * (1 - share) + bounds[b + 2 * part + 1] * share;
+      [[position, 0, 0], [scale, 3, SCALES]].forEach(([packed, part, place]) => {
+        into[o + place] = between(part, (packed >>> 21) / 2047);
+        into[o + place + 1] = between(part + 1, ((packed >>> 11) & 1023) / 1023);
+        into[o + place + 2] = between(part + 2, (packed & 2047) / 2047);
+      });
+      for (let c = 0; c < 3; c++) into[o + COLOR + c] = (between(6 + c, ((color >>> (24 - 8 * c)) & 255) / 255) - 0.5) / SH_C0;
+      into[o + OPACITY] = LOGITS[color & 255];
+      setRotation(into, o + ROTATION, rotation >>> 30, [20, 10, 0].map((shift) => (((rotation >>> shift) & 1023) / 1023 - 0.5) * Math.SQRT2));
+      for (let n = 0; n < rest; n++) into[o + HARMONICS + n] = STEPS[bytes[i * rest + n]];
+    }
   }, plyRendering(comments, []));
 }
 
@@ -223,24 +232,4 @@ async function chunksAndRows(reader, chunk, vertex) {
     for (let i = 0; i < chunk.count; i++) bounds[18 * i + 2 * part + high] = place < 0 ? high : values[i * names.length + place];
   }));
   return { bounds, rows: new Uint32Array((await reader.take(vertex.count * vertex.stride)).buffer) };
-}
-
-/**
- * @param {{bounds: Float32Array, rows: Uint32Array}} read
- * @param {number} i index of the Gaussian
- * @param {number[]} order order of the four packed values
- * @param {Float32Array} into
- * @param {number} o offset of its row
- */
-function unpackRow({ bounds, rows }, i, order, into, o) {
-  const [position, rotation, scale, color] = order.map((place) => rows[4 * i + place]), b = 18 * Math.floor(i / CHUNK);
-  const between = (/** @type {number} */ part, /** @type {number} */ share) => bounds[b + 2 * part] * (1 - share) + bounds[b + 2 * part + 1] * share;
-  [[position, 0, 0], [scale, 3, SCALES]].forEach(([packed, part, place]) => {
-    into[o + place] = between(part, (packed >>> 21) / 2047);
-    into[o + place + 1] = between(part + 1, ((packed >>> 11) & 1023) / 1023);
-    into[o + place + 2] = between(part + 2, (packed & 2047) / 2047);
-  });
-  for (let c = 0; c < 3; c++) into[o + COLOR + c] = (between(6 + c, ((color >>> (24 - 8 * c)) & 255) / 255) - 0.5) / SH_C0;
-  into[o + OPACITY] = LOGITS[color & 255];
-  setRotation(into, o + ROTATION, rotation >>> 30, [20, 10, 0].map((shift) => (((rotation >>> shift) & 1023) / 1023 - 0.5) * Math.SQRT2));
 }

@@ -2,8 +2,6 @@
 /** Selection of a scene's Gaussians: requests to the scene's worker, and a texture that highlights the selected ones. */
 import { pickedView } from "./pick_pass.js";
 
-/** @typedef {import("./viewer.js").Viewer} Viewer */
-/** @typedef {import("./splat_scene.js").SplatScene} SplatScene */
 /** @typedef {{begin: number, flags: Uint8Array, total: number, past: number, future: number, bits?: Uint8Array}} Changed `total`: selected Gaussians; `past` and `future`: changes that can be undone and redone */
 
 /** Gaussians in the longest row of a texture; updates start at a multiple of it. */
@@ -11,8 +9,8 @@ const ROW = 8192;
 
 export class Selection {
   /**
-   * @param {Viewer} viewer
-   * @param {SplatScene} scene a scene that is completely loaded
+   * @param {import("./viewer.js").Viewer} viewer
+   * @param {import("./splat_scene.js").SplatScene} scene a scene that is completely loaded
    * @param {(changed: Changed) => void} told called after each change
    */
   constructor(viewer, scene, told) {

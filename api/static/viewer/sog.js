@@ -11,7 +11,6 @@ import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, setRotation, unpac
 import { extrasRendering } from "./render_tag.js";
 import { words } from "../words.js";
 
-/** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
 /** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
 /** SH coefficients per color channel by the width of the palette's image, which has 64 vectors in a row. */
@@ -32,7 +31,7 @@ const META = "meta.json", INDEX = "lod-meta.json";
  *   writes the rows of `some` Gaussians to `into` from `o` on; `stride` is the number of coefficients in a row
  */
 
-/** @param {ByteReader} reader @returns {Promise<SceneFile>} */
+/** @param {import("./byte_reader.js").ByteReader} reader @returns {Promise<SceneFile>} */
 export async function sog(reader) {
   const files = await unzipped(await reader.all());
   const [index] = [...files.keys()].filter((name) => `/${name}`.endsWith(`/${INDEX}`)).sort((a, b) => a.length - b.length);

@@ -4,7 +4,6 @@ import { harmonicTexels } from "./packing.js";
 import { words } from "../words.js";
 
 /** @typedef {{center: number[], radius: number, low: number[], high: number[]}} Middle */
-/** @typedef {import("./depth_order.js").Pose} Pose */
 /** @typedef {{count: number, degree: number, size: number, rendering: import("./render_tag.js").Rendering, front?: number[]}} Shown values of a file's header */
 
 /** @typedef {Error & {cut: boolean}} SceneFailure `cut`: whether the file ends too early */
@@ -160,7 +159,7 @@ export class SplatScene {
   /**
    * Request a depth order, unless one is being computed.
    *
-   * @param {Pose} pose
+   * @param {import("./depth_order.js").Pose} pose
    * @param {number} number number of the pose
    */
   sort(pose, number) {

@@ -85,13 +85,27 @@ function spzScene(head, load, newest) {
   let read = null;
   return unpacked(count, drawn, async (begin, into, width, some) => {
     read ??= await load([version === 1 ? 6 : 9, 1, 3, 3, version < 3 ? 3 : 4, stored].map((bytes) => bytes * count));
-    const { sections, rotated } = read, harmonics = sections[5];
-    for (let i = 0; i < some; i++) {
-      unpackSpz(sections, begin + i, version, unit, into, i * width);
-      for (let n = 0; n < rest; n++) {
-        into[i * width + HARMONICS + (n % 3) * coefficients + Math.floor(n / 3)] = (harmonics[(begin + i) * stored + n] - 128) / 128;
+    const { sections: [positions, opacities, colors, scales, rotations, harmonics], rotated } = read;
+    for (let i = begin, o = 0; i < begin + some; i++, o += width) {
+      for (let axis = 0; axis < 3; axis++) {
+        const p = 9 * i + 3 * axis;
+        into[o + axis] = version === 1
+          ? fromHalf(positions[6 * i + 2 * axis] | (positions[6 * i + 2 * axis + 1] << 8))
+          : (((positions[p] | (positions[p + 1] << 8) | (positions[p + 2] << 16)) << 8) >> 8) * unit;
+        into[o + SCALES + axis] = scales[3 * i + axis] / 16 - 10;
+        into[o + COLOR + axis] = (colors[3 * i + axis] / 255 - 0.5) / 0.15;
       }
-      if (rotated) rotate(into, i * width, coefficients);
+      into[o + OPACITY] = LOGITS[opacities[i]];
+      if (version < 3) setRotation(into, o + ROTATION, 0, [0, 1, 2].map((part) => rotations[3 * i + part] / 127.5 - 1));
+      else {
+        const r = 4 * i, packed = rotations[r] | (rotations[r + 1] << 8) | (rotations[r + 2] << 16) | (rotations[r + 3] << 24);
+        const part = (/** @type {number} */ bits) => ((bits & 512 ? -1 : 1) * (bits & 511) * Math.SQRT1_2) / 511;
+        setRotation(into, o + ROTATION, packed >>> 30, [20, 10, 0].map((shift) => part((packed >>> shift) & 1023)), 1);
+      }
+      for (let n = 0; n < rest; n++) into[o + HARMONICS + (n % 3) * coefficients + Math.floor(n / 3)] = (harmonics[i * stored + n] - 128) / 128;
+      if (!rotated) continue;
+      for (const value of [1, 2, ROTATION + 2, ROTATION + 3]) into[o + value] *= -1;
+      for (let n = 0; n < rest; n++) into[o + HARMONICS + n] *= ROTATED[n % coefficients];
     }
   }, antialiased ? ANTIALIASED : CLASSIC);
 }
@@ -107,42 +121,4 @@ function statesRub(records) {
     if (view.getUint32(o, true) === AXES_EXTENSION) return [0, 4].includes(view.getUint32(o + 8, true));
   }
   return true;
-}
-
-/**
- * Rotate a Gaussian by 180 degrees about x.
- *
- * @param {Float32Array} into
- * @param {number} o offset of its row
- * @param {number} coefficients number of harmonics per color channel
- */
-function rotate(into, o, coefficients) {
-  for (const value of [1, 2, ROTATION + 2, ROTATION + 3]) into[o + value] *= -1;
-  for (let n = 0; n < 3 * coefficients; n++) into[o + HARMONICS + n] *= ROTATED[n % coefficients];
-}
-
-/**
- * @param {Uint8Array<ArrayBuffer>[]} sections positions, opacities, colors, scales, rotations
- * @param {number} i index of the Gaussian
- * @param {number} version
- * @param {number} unit unit of positions
- * @param {Float32Array} into
- * @param {number} o offset of its row
- */
-function unpackSpz([positions, opacities, colors, scales, rotations], i, version, unit, into, o) {
-  for (let axis = 0; axis < 3; axis++) {
-    const p = 9 * i + 3 * axis;
-    into[o + axis] = version === 1
-      ? fromHalf(positions[6 * i + 2 * axis] | (positions[6 * i + 2 * axis + 1] << 8))
-      : (((positions[p] | (positions[p + 1] << 8) | (positions[p + 2] << 16)) << 8) >> 8) * unit;
-    into[o + SCALES + axis] = scales[3 * i + axis] / 16 - 10;
-    into[o + COLOR + axis] = (colors[3 * i + axis] / 255 - 0.5) / 0.15;
-  }
-  into[o + OPACITY] = LOGITS[opacities[i]];
-  if (version < 3) setRotation(into, o + ROTATION, 0, [0, 1, 2].map((part) => rotations[3 * i + part] / 127.5 - 1));
-  else {
-    const r = 4 * i, packed = rotations[r] | (rotations[r + 1] << 8) | (rotations[r + 2] << 16) | (rotations[r + 3] << 24);
-    const part = (/** @type {number} */ bits) => ((bits & 512 ? -1 : 1) * (bits & 511) * Math.SQRT1_2) / 511;
-    setRotation(into, o + ROTATION, packed >>> 30, [20, 10, 0].map((shift) => part((packed >>> shift) & 1023)), 1);
-  }
 }

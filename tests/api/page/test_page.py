@@ -119,7 +119,7 @@ def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[st
     choose(watched, files | {"scene": big})
     page.get_by_role("button", name="Start").click()
     wait_for(lambda: page.evaluate("1") and any(offset > 0 for _, offset, _ in sent), "a second part")
-    page.get_by_role("button", name="Pause").wait_for()
+    page.get_by_role("button", name="Stop").wait_for()
     page.reload()  # while the routes are there, or the parts that hang would be sent
     page.unroute_all(behavior="ignoreErrors")
     appear(
@@ -152,7 +152,7 @@ def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[st
     assert sent == []
 
 
-def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
+def test_upload_stops_and_resumes(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
     big = large_scene(tmp_path / "big.ply", 300, 200)
     watched = visit(allowed=["net::ERR", "423", "409"])  # the first part may still hold the upload, or end meanwhile
     page = watched.page
@@ -164,10 +164,10 @@ def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_pat
     choose(watched, files | {"scene": big})
     page.get_by_role("button", name="Start").click()
     wait_for(lambda: page.evaluate("1") and held, "a part to be sent")
-    page.get_by_role("button", name="Pause").click()
-    page.get_by_text("paused at 0%").wait_for()
+    page.get_by_role("button", name="Stop").click()
+    page.get_by_role("button", name="Stop").wait_for(state="hidden")
     page.unroute_all(behavior="ignoreErrors")
-    click(page.get_by_role("button", name="Resume"), page.get_by_role("button", name="Cancel"))
+    click(page.get_by_role("button", name="Start"), page.get_by_role("button", name="Cancel"))
     page.locator(".badge", has_text="Canceled").wait_for()
 
 
