@@ -44,11 +44,7 @@ export class Blend {
     return { input, output, element: h("div.slider", h("label", { htmlFor: id }, name), input, output, mark) };
   }
 
-  /**
-   * Create the triangle of the original and two results. It is for pointers; the sliders reach the same blends.
-   *
-   * @param {string[]} names
-   */
+  /** Create the triangle, for pointers; the sliders reach the same blends. @param {string[]} names */
   triangle(names) {
     this.dot = h("span.dot");
     this.area = h("div.area", h("span.shape"), this.dot);
@@ -68,7 +64,6 @@ export class Blend {
     return h("div.triangle", { "aria-hidden": "true" }, h("span.corner", words.viewer.original), this.area, h("div.corners", names.map((name) => h("span.corner", name))));
   }
 
-  /** Compute the weights, and show them. */
   weigh() {
     const { style, second } = this;
     const weights = this.jobs.length > 1 ? [1 - style, style * (1 - second), style * second] : [1 - style, style];

@@ -139,12 +139,7 @@ export function ringCameras(middle, { count, up, elevation, radius }) {
   });
 }
 
-/**
- * Return the lines of small camera frames, as pairs of points.
- *
- * @param {JobCamera[]} cameras
- * @param {number} size size of a frame, world units
- */
+/** Return lines of frames, as pairs of points. @param {JobCamera[]} cameras @param {number} size world units */
 export function cameraLines(cameras, size) {
   return Float32Array.from(cameras.flatMap(({ position, axes: [right, down, forward], fx, fy, width, height }) => {
     const x = (size * width) / 2 / fx, y = (size * height) / 2 / fy;

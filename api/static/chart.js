@@ -7,12 +7,7 @@ import { rough, words } from "./words.js";
 
 const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 26, BOTTOM = 34;
 
-/**
- * Return the values to label on a logarithmic axis; the fewer decades, the more values in each.
- *
- * @param {number} low
- * @param {number} high
- */
+/** Return the values to label on a logarithmic axis. @param {number} low @param {number} high */
 function ticks(low, high) {
   const decades = Math.log10(high / low);
   const digits = decades < 0.5 ? [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9] : decades < 1.2 ? [1, 2, 3, 5, 7] : decades < 4 ? [1, 2, 5] : [1];

@@ -39,16 +39,11 @@ export function svg(name, properties, ...children) {
   return made;
 }
 
-/**
- * @param {Element} made
- * @param {any} properties
- * @param {any[]} children
- * @param {(key: string, value: any) => void} set
- */
-function fill(made, properties, children, set) {
-  const plain = properties && typeof properties === "object" && !Array.isArray(properties) && !(properties instanceof Node);
-  if (!plain) children.unshift(properties);
-  for (const [key, value] of Object.entries(plain ? properties : {})) {
+/** @param {Element} made @param {any} given @param {any[]} children @param {(key: string, value: any) => void} set */
+function fill(made, given, children, set) {
+  const plain = given && typeof given === "object" && !Array.isArray(given) && !(given instanceof Node);
+  if (!plain) children.unshift(given);
+  for (const [key, value] of Object.entries(plain ? given : {})) {
     if (value === undefined || value === null) continue;
     if (key.startsWith("on") && typeof value === "function") made.addEventListener(key.slice(2), value);
     else set(key, value);

@@ -41,11 +41,7 @@ export class JobStage {
     this.next = "";
   }
 
-  /**
-   * Give the 3D view to the view of a job that paints on this result, or on whose result this job has painted.
-   *
-   * @param {string} id
-   */
+  /** Give the 3D view to that of a job that paints on this one, or that this one paints on. @param {string} id */
   handOver(id) {
     const shown = this.result ?? this.live;
     return shown?.stage.viewer && (id === this.next || id === baseOf(this.id)) ? shown.handOver(id === this.next) : undefined;
@@ -127,11 +123,7 @@ export class JobStage {
     if (!this.leaving.aborted) this.showResult(job, hasSheet, kept ? live : undefined);
   }
 
-  /**
-   * @param {any} job
-   * @param {boolean} hasSheet
-   * @param {ResultStage} [kept] stage that has shown the job while it ran
-   */
+  /** @param {any} job @param {boolean} hasSheet @param {ResultStage} [kept] stage that has shown the running job */
   showResult(job, hasSheet, kept) {
     this.result = kept ?? new ResultStage([job], { signal: this.leaving, stage: this.takeFirst() });
     this.result.stage.title = this.title;

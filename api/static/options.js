@@ -27,12 +27,7 @@ export const titleOf = (name) => {
   return text[0].toUpperCase() + text.slice(1);
 };
 
-/**
- * @param {string} name
- * @param {any} schema schema of the parameter
- * @param {{title?: string, hint?: boolean}} [how]
- * @returns {Control}
- */
+/** @param {string} name @param {any} schema @param {{title?: string, hint?: boolean}} [how] @returns {Control} */
 export function optionControl(name, schema, { title = titleOf(name), hint = true } = {}) {
   const id = newId(), kinds = variants(schema), shown = words.options.defaults[name];
   const preset = schema["x-default"] ?? schema.default ?? "", onOff = preset === true ? words.submit.on : preset === false ? words.submit.off : preset;
@@ -151,11 +146,7 @@ const WEIGHTS = /** @type {any} */ ("{{strengths}}");
 /** Return the strength that a content weight is, or else the weight as text. @param {string | number} weight */
 export const strengthName = (weight) => Object.keys(WEIGHTS).find((name) => WEIGHTS[name] === Number(weight)) ?? String(weight);
 
-/**
- * Add pictures to the input of the strength. Return a function that checks the picture of the input's value.
- *
- * @param {Control} control
- */
+/** Add pictures of strengths. Return a function that checks that of the input's value. @param {Control} control */
 export function addPictures(control) {
   const name = newId();
   /** @type {HTMLInputElement[]} */

@@ -104,7 +104,6 @@ export class OptionsPart {
     return { ...(orbiting ? { orbit: "auto" } : {}), ...this.values(this.applying(orbiting)), ...(this.preset ? { preset: this.preset } : {}) };
   }
 
-  /** Fill in the time budget that suits the service's machine. */
   useBudget() {
     this.restore({ within: this.budget }, undefined);
   }

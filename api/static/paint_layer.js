@@ -122,12 +122,7 @@ export class PaintLayer {
 /** Bytes of the signature and of the first chunk (IHDR), after which texts may stand. */
 const START = 33;
 
-/**
- * Return a text of an image; undefined if there is none.
- *
- * @param {Blob} image
- * @param {string} keyword
- */
+/** Return a text of an image; undefined if there is none. @param {Blob} image @param {string} keyword */
 export async function pngText(image, keyword) {
   const bytes = new Uint8Array(await image.arrayBuffer()), view = new DataView(bytes.buffer);
   for (let at = 8; at + 12 <= bytes.length; at += 12 + view.getUint32(at)) {
@@ -140,13 +135,7 @@ export async function pngText(image, keyword) {
   }
 }
 
-/**
- * Return a PNG with a text.
- *
- * @param {Blob} png
- * @param {string} keyword
- * @param {string} text ASCII
- */
+/** Return a PNG with a text. @param {Blob} png @param {string} keyword @param {string} text ASCII */
 export function withPngText(png, keyword, text) {
   const data = new TextEncoder().encode(`tEXt${keyword}\0${text}`), chunk = new Uint8Array(data.length + 8), view = new DataView(chunk.buffer);
   view.setUint32(0, data.length - 4);

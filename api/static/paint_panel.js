@@ -28,11 +28,7 @@ const LONGEST = 1024;
 const SHARED = ["background", "orbit", "up", "elevation", "radius", "views", "resolution", "near", "drop_invalid", "spz_axes", "render_mode", "eps2d", "pad_sh"];
 
 export class PaintPanel {
-  /**
-   * @param {import("./stage.js").Stage} stage
-   * @param {Base} base
-   * @param {AbortSignal} leaving
-   */
+  /** @param {import("./stage.js").Stage} stage @param {Base} base @param {AbortSignal} leaving */
   constructor(stage, base, leaving) {
     this.stage = stage;
     this.base = base;
@@ -59,12 +55,7 @@ export class PaintPanel {
     document.addEventListener("keydown", (event) => this.key(event), { signal: leaving });
   }
 
-  /**
-   * Freeze the current view, or the one that an image states.
-   *
-   * @param {StatedView} [stated]
-   * @returns {boolean} whether there is a scene to paint on
-   */
+  /** Freeze the current view, or a stated one. Return whether there is a scene. @param {StatedView} [stated] */
   freeze(stated) {
     const { stage, base } = this, { viewer, controls } = stage, side = base.side();
     if (!viewer || !side?.scene.whole) {
@@ -94,7 +85,6 @@ export class PaintPanel {
     return true;
   }
 
-  /** Let the view move again. */
   thaw() {
     const { viewer } = this.stage;
     if (!viewer || !this.view) return;
@@ -117,7 +107,6 @@ export class PaintPanel {
     this.undo.disabled = this.apply.disabled = !this.layer.marks.length;
   }
 
-  /** Save the frozen view as an image to paint on. */
   async download() {
     const { viewer } = this.stage;
     if (!viewer) return;

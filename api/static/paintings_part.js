@@ -76,7 +76,6 @@ export class PaintingsPart {
     }]);
   }
 
-  /** Return what `restore` needs. */
   kept() {
     return { weights: Object.fromEntries(Object.entries(this.weights).map(([name, input]) => [name, input.value])), apart: this.apart.input.checked };
   }
@@ -112,7 +111,6 @@ export class ExamplePart {
     this.element = h("div.example", this.button, h("small", words.example.credit));
   }
 
-  /** Return the files of the example by role. */
   async files() {
     this.button.textContent = words.example.preparing;
     try {

@@ -15,7 +15,6 @@ export class Refusals {
     this.slots = slots;
     this.options = options;
     this.regions = regions;
-    /** Element for errors without an input. */
     this.element = h("p.wrong.block", { hidden: true, role: "alert" });
   }
 

@@ -165,7 +165,6 @@ export class RegionList {
     for (const row of this.rows) row.wrong("");
   }
 
-  /** Mark the regions that select nothing or have no name. */
   markMissing() {
     for (const row of this.rows) {
       const { name, select } = row.value();

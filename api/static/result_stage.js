@@ -129,22 +129,16 @@ export class ResultStage {
 
   /** @param {any} job */
   async openRun(job) {
-    const { viewer } = this.stage, name = this.jobs.length > 1 ? labels(this.jobs)[this.jobs.indexOf(job)] : resultName(job);
-    if (!viewer || this.signal.aborted) return;
-    const fade = this.live?.ownScene ? 0 : (job.parameters.sh_attenuation ?? 0);
-    if (this.live) {
-      if (!this.original || !this.live.painted) return;
-      await this.fetchColors(job, this.live.painted);
-      this.choices.set(job.id, { name: say.now, side: { scene: this.original, colors: job.id, fade } });
-      return;
-    }
-    if (this.original && sceneOf(job) === sceneOf(this.jobs[0]) && drawnAlike(job, this.jobs[0])) {
+    const { viewer } = this.stage, { live, original } = this, [first] = this.jobs;
+    const name = live ? say.now : this.jobs.length > 1 ? labels(this.jobs)[this.jobs.indexOf(job)] : resultName(job);
+    if (!viewer || this.signal.aborted || (live && !(original && live.painted))) return;
+    if (original && (live || (sceneOf(job) === sceneOf(first) && drawnAlike(job, first)))) {
+      const fade = live?.ownScene ? 0 : (job.parameters.sh_attenuation ?? 0);
       try {
-        await this.fetchColors(job, "colors.f16");
-        this.choices.set(job.id, { name, side: { scene: this.original, colors: job.id, fade } });
-        return;
+        await this.fetchColors(job, live?.painted ?? "colors.f16");
+        return void this.choices.set(job.id, { name, side: { scene: original, colors: job.id, fade } });
       } catch (error) {
-        if (!(error instanceof Problem) || error.status !== 404) throw error;
+        if (live || !(error instanceof Problem) || error.status !== 404) throw error;
       }
     }
     const scene = viewer.open(new URL(this.files(job).result("stylized.ply"), location.href).href);
@@ -255,11 +249,7 @@ export class ResultStage {
     return scene && colors ? { scene, colors, fade } : undefined;
   }
 
-  /**
-   * Give the stage to another view.
-   *
-   * @param {boolean} shown whether what is shown is the original of the other view; otherwise all scenes end
-   */
+  /** Give the stage to another view. @param {boolean} shown whether what is shown is that view's original, and stays */
   handOver(shown) {
     const { viewer } = this.stage, scene = viewer?.sides?.left.scene, kept = shown && scene;
     for (const each of new Set([scene, ...[...this.choices.values()].map(({ side }) => side.scene)])) if (each !== kept) each?.end();

@@ -25,7 +25,6 @@ export class SelectPanel {
     /** Points of the current stroke or lasso, in CSS pixels of the canvas. @type {number[]} */
     this.drawn = [];
     this.change = 0;
-    /** Number of selected Gaussians. */
     this.total = 0;
     this.erasing = false;
     /** Points of a stroke to send at the next frame, and its request. @type {number[]} */

@@ -86,7 +86,6 @@ export class Slot {
     this.input.focus();
   }
 
-  /** Follow a change of the files. */
   update() {
     this.broken = "";
     this.show();
@@ -94,7 +93,6 @@ export class Slot {
     this.check();
   }
 
-  /** Say which own file cannot be used. */
   async check() {
     const { files } = this;
     for (const file of files) {
@@ -149,7 +147,6 @@ export class Slot {
     this.input.focus();
   }
 
-  /** Drop the files of an earlier job. */
   dropStored() {
     this.files = this.files.filter((file) => !(file instanceof StoredFile));
     this.update();
@@ -233,12 +230,7 @@ async function droppedFiles(data) {
   return found;
 }
 
-/**
- * Take files that are dropped anywhere on the page.
- *
- * @param {(files: File[]) => void} take
- * @param {AbortSignal} signal ends this
- */
+/** Take files that are dropped anywhere. @param {(files: File[]) => void} take @param {AbortSignal} signal ends this */
 export function listenToDrops(take, signal) {
   const hint = h("div.dropping", { "aria-hidden": "true" }, words.submit.dropNow);
   let depth = 0;

@@ -12,6 +12,7 @@ import { words } from "./words.js";
 
 /** @typedef {import("./cameras.js").JobCamera} JobCamera */
 /** @typedef {import("./viewer/viewer.js").Side} Side */
+/** @typedef {import("./viewer/headset.js").Mode} Mode */
 
 const say = words.viewer;
 
@@ -47,7 +48,6 @@ export class Stage {
     this.outline = new Float32Array(0);
     /** Lines of the box that the scene is cropped to. */
     this.cropped = new Float32Array(0);
-    this.hasFrames = false;
     this.framesShown = true;
     this.up = before?.up ?? [0, -1, 0];
     try {
@@ -104,12 +104,7 @@ export class Stage {
     }
   }
 
-  /**
-   * Show the scene in the headset, or end that.
-   *
-   * @param {import("./viewer/headset.js").Mode} mode
-   * @param {HTMLElement} button
-   */
+  /** Show the scene in the headset, or end that. @param {Mode} mode @param {HTMLElement} button */
   async enter(mode, button) {
     const { viewer } = this;
     if (!viewer || viewer.headset) return viewer?.headset?.end();
@@ -192,7 +187,6 @@ export class Stage {
    */
   setCameras(cameras, { frames = false, stand = false } = {}) {
     this.cameras = cameras;
-    this.hasFrames = frames;
     if (!this.viewer) return;
     this.framesButton.hidden = !frames || !cameras.length;
     if (cameras.length > 1) this.up = upOf(cameras);
@@ -213,15 +207,12 @@ export class Stage {
     const { viewer } = this;
     if (!viewer) return;
     const middle = viewer.sides?.left.scene.middle ?? null, length = frameSize(this.cameras, middle);
-    const shown = this.hasFrames && this.framesShown ? this.cameras.filter((_, i) => i !== this.stood) : [];
+    const shown = this.framesButton.hidden || !this.framesShown ? [] : this.cameras.filter((_, i) => i !== this.stood);
     viewer.lines = viewer.frozen ? new Float32Array(0) : Float32Array.of(...cameraLines(shown, length), ...this.outline, ...this.cropped);
     viewer.draw();
   }
 
-  /**
-   * @param {number} index index of a camera; wraps around
-   * @param {boolean} [aloud] announce the camera to screen readers
-   */
+  /** @param {number} index index of a camera; wraps around @param {boolean} [aloud] whether to announce it */
   stand(index, aloud = true) {
     const { viewer, cameras } = this;
     if (!viewer || !cameras.length) return;

@@ -27,12 +27,7 @@ export class StoredFile {
   }
 }
 
-/**
- * Return the scene, styles and cameras of a job by role, in their order.
- *
- * @param {any} job
- * @returns {Record<string, StoredFile[]>}
- */
+/** Return a job's inputs by role, in their order. @param {any} job @returns {Record<string, StoredFile[]>} */
 export function storedInputs(job) {
   /** @type {Record<string, StoredFile[]>} */
   const found = { scene: [], style: [], cameras: [], photos: [], mask: [] };

@@ -31,7 +31,6 @@ export class Submission {
     this.element = h("div.sending", { hidden: true }, h("div.row", this.title, this.text, this.stopButton), this.bar);
   }
 
-  /** Prepare for another request. */
   restart() {
     this.stopped = false;
     this.stopping = new AbortController();

@@ -267,7 +267,6 @@ export class SubmitView {
     }
   }
 
-  /** Return the files of the scene. */
   sceneFiles() {
     return { scene: this.slots.scene.files, cameras: this.views.orbiting ? [] : this.slots.cameras.files };
   }

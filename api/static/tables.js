@@ -10,10 +10,7 @@ export const statusTitles = states.titles;
 export const stepFraction = ({ status, progress }) => (states.stepping.includes(status) && progress?.total ? progress.fraction : undefined);
 export const UNFINISHED = new Set(states.unfinished), WORKING = new Set(states.working);
 
-/**
- * Return the actions that a status allows: `POST /v1/jobs/{id}/{name}`, with the text of the button.
- * @param {string} status
- */
+/** Return the actions that a status allows, `POST /v1/jobs/{id}/{name}`, with their titles. @param {string} status */
 export const actionsOf = (status) => states.actions.filter((action) => action.statuses.includes(status));
 
 /**

@@ -1,7 +1,5 @@
 // @ts-check
-/**
- * Uploads in parts (tus 1.0). Parts that have arrived are not sent again after a stop, a lost connection or a reload.
- */
+/** Uploads in parts (tus 1.0). What has arrived is not sent again after a stop, a lost connection or a reload. */
 import { ask, Problem, Unreachable } from "./api.js";
 import { words } from "./words.js";
 
@@ -55,11 +53,7 @@ export const forgetUnfinished = () => {
   for (const [print, { sent, size }] of Object.entries(kept())) if (sent < size) keep(print, null);
 };
 
-/**
- * Return a fingerprint of a file, from its name, its size, its modification time and samples of its content.
- *
- * @param {File} file
- */
+/** Return a fingerprint: name, size, modification time and hashes of samples of a file. @param {File} file */
 export async function fingerprint(file) {
   const pieces = file.size <= SAMPLES * SAMPLE ? [file] : Array.from({ length: SAMPLES }, (_, i) => {
     const at = Math.floor(((file.size - SAMPLE) * i) / (SAMPLES - 1));

@@ -122,7 +122,6 @@ export class ViewsPart {
     return [ringCameras(middle, { count: shown, up, elevation: controls.get("elevation")?.value() ?? 10, radius: controls.get("radius")?.value() }), told];
   }
 
-  /** Choose an orbit as in a draft. */
   restore() {
     this.around.input.checked = true;
     this.chosen = this.slots.cameras.files.length > 0;
@@ -145,7 +144,6 @@ export class ScenePart {
     this.opened = null;
   }
 
-  /** Show the scene of the slot, or nothing. */
   async show() {
     const [file] = this.slot.files, { viewer } = this.stage;
     this.opened?.end();

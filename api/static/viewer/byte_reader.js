@@ -20,12 +20,7 @@ export class ByteReader {
     this.rest = new Uint8Array(0);
   }
 
-  /**
-   * Return the next bytes without taking them; fewer at the end of the stream.
-   *
-   * @param {number} count
-   * @returns {Promise<Uint8Array>}
-   */
+  /** Return the next bytes without taking them; fewer at the end of the stream. @param {number} count */
   async peek(count) {
     while (this.rest.length < count) {
       const { value, done } = await this.reader.read();
@@ -38,13 +33,7 @@ export class ByteReader {
     return this.rest.subarray(0, count);
   }
 
-  /**
-   * Take the next bytes, in a buffer of their own.
-   *
-   * @param {number} count
-   * @returns {Promise<Uint8Array<ArrayBuffer>>}
-   * @throws {SceneError} if the stream ends before
-   */
+  /** Take the next bytes, in a buffer of their own. @param {number} count @throws {CutError} if it ends before */
   async take(count) {
     const found = new Uint8Array(count);
     for (let filled = 0; filled < count;) {
@@ -72,12 +61,7 @@ export class ByteReader {
     return new Uint8Array(await new Blob(/** @type {BlobPart[]} */ (parts)).arrayBuffer());
   }
 
-  /**
-   * Return a reader of the remaining bytes, piped through another stream.
-   *
-   * @param {ReadableWritablePair<Uint8Array, any>} through
-   * @returns {ByteReader}
-   */
+  /** Return a reader of the remaining bytes, converted. @param {ReadableWritablePair<Uint8Array, any>} through */
   piped(through) {
     const all = new ReadableStream({
       pull: async (out) => {
@@ -90,7 +74,6 @@ export class ByteReader {
     return new ByteReader(all.pipeThrough(through));
   }
 
-  /** Cancel the stream. */
   end() {
     this.reader.cancel().catch(() => {});
   }
@@ -133,13 +116,7 @@ export function fromHalf(half) {
 const END = 0x06054b50, END_BYTES = 22, MAX_COMMENT = 65535, ENTRY = 0x02014b50, ENTRY_BYTES = 46;
 const STORED = 0, DEFLATED = 8;
 
-/**
- * Return the files of an archive.
- *
- * @param {Uint8Array<ArrayBuffer>} data
- * @returns {Promise<Files>}
- * @throws {CutError} if the archive ends too early
- */
+/** Return the files of an archive. @param {Uint8Array<ArrayBuffer>} data @throws {CutError} if it ends too early */
 export async function unzipped(data) {
   const view = new DataView(data.buffer, data.byteOffset, data.length), { length } = data;
   let end = length - END_BYTES;

@@ -28,7 +28,6 @@ export class ViewCamera {
     this.near = 0.2;
     /** Returns the principal point in pixels from the middle of a canvas. @type {(width: number, height: number) => number[]} */
     this.shift = () => [0, 0];
-    /** Number of the last change. */
     this.number = 0;
   }
 
@@ -97,23 +96,13 @@ export class ViewCamera {
     this.number++;
   }
 
-  /**
-   * Return the focal lengths in pixels of a canvas. A job's camera shows its whole frame.
-   *
-   * @param {number} width
-   * @param {number} height
-   */
+  /** Return focal lengths in pixels; a job's whole frame is shown. @param {number} width @param {number} height */
   pixels(width, height) {
     const frame = this.shape ? Math.min(height, width / this.shape) : Math.min(height, width * NARROW);
     return [this.focal[0] * frame, this.focal[1] * frame];
   }
 
-  /**
-   * Return the camera of a canvas's image, as jobs take it.
-   *
-   * @param {number[]} size width and height in pixels
-   * @returns {import("../cameras.js").RestCamera}
-   */
+  /** Return the camera of an image of this size, as jobs take it. @param {number[]} size width and height */
   ofImage([width, height]) {
     const [fx, fy] = this.pixels(width, height);
     return { width, height, fx, fy, cx: width / 2, cy: height / 2, world_to_camera: this.axes.map((axis) => [...axis, -dot(axis, this.eye)]) };

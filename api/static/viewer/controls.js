@@ -1,9 +1,5 @@
 // @ts-check
-/**
- * Controls of the viewer: mouse, touch, pen, wheel and keys, and movements of the camera that last.
- *
- * Movements depend on time, not on the number of events.
- */
+/** Controls of the viewer: mouse, touch, pen, wheel and keys, and movements over time. */
 import { difference, sum, times } from "./vectors.js";
 
 /** @typedef {import("./viewer.js").Viewer} Viewer */
@@ -175,11 +171,7 @@ export class Motion {
     this.start();
   }
 
-  /**
-   * Move through viewpoints, and stay at the last one. Without animations, the camera jumps: at once to a single one.
-   *
-   * @param {JobCamera[]} viewpoints
-   */
+  /** Move through viewpoints and stay at the last; jump if animations are unwanted. @param {JobCamera[]} viewpoints */
   fly(viewpoints) {
     this.stop();
     this.flyTo(viewpoints, stillness() && viewpoints.length < 2 ? 0 : FLIGHT);

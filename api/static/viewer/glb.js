@@ -68,12 +68,7 @@ export async function glb(reader) {
 
 /** @typedef {Pose & {count: number, readers: Reader[]}} Part set of Gaussians: readers of `NAMES`, then of harmonics */
 
-/**
- * Return all sets of Gaussians, their largest SH degree and their render mode.
- *
- * @param {string} text the JSON document
- * @param {number} bytes size of the data
- */
+/** Return all sets of Gaussians, their largest SH degree and render mode. @param {string} text @param {number} bytes */
 function partsOf(text, bytes) {
   const { accessors, bufferViews, meshes, nodes = [] } = JSON.parse(text);
   const isSplats = (/** @type {any} */ each) => Boolean(each.extensions?.[EXTENSION]);
@@ -93,13 +88,7 @@ function partsOf(text, bytes) {
   return { parts, degree, rendering: extrasRendering(first.extras) };
 }
 
-/**
- * Return the pose of a node, with those of the nodes above it.
- *
- * @param {any[]} nodes
- * @param {number} index
- * @returns {Pose}
- */
+/** Return the pose of a node, below those above it. @param {any[]} nodes @param {number} index @returns {Pose} */
 function poseOf(nodes, index) {
   let rows = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], depth = 0;
   for (let at = index; at >= 0 && depth <= MAX_DEPTH; at = nodes.findIndex(({ children = [] }) => children.includes(at)), depth++) rows = product(rowsOf(nodes[at]), rows);

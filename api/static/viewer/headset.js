@@ -137,13 +137,7 @@ export class Headset {
     return { left: side, right: side };
   }
 
-  /**
-   * Move as hands, sticks and buttons ask for.
-   *
-   * @param {any} frame
-   * @param {any} pose
-   * @param {number} seconds since the last frame
-   */
+  /** Move as hands, sticks and buttons ask for. @param {any} frame @param {any} pose @param {number} seconds */
   move(frame, pose, seconds) {
     const head = vector(pose.transform.position), grips = new Map(), rays = new Map();
     this.original = false;
@@ -171,12 +165,7 @@ export class Headset {
     this.grips = grips;
   }
 
-  /**
-   * @param {any} pose
-   * @param {number} x deflection to the right
-   * @param {number} y deflection backward
-   * @param {number} seconds
-   */
+  /** @param {any} pose @param {number} x to the right @param {number} y backward @param {number} seconds */
   walk(pose, x, y, seconds) {
     const m = pose.transform.matrix, flat = Math.hypot(m[8], m[10]) || 1, back = [m[8] / flat, 0, m[10] / flat], right = [back[2], 0, -back[0]];
     this.placement.shift(times(sum(times(right, x), times(back, y)), -WALK * seconds));
@@ -192,11 +181,7 @@ export class Headset {
   }
 }
 
-/**
- * Return where a hand's ray starts, and where it reaches the floor; null if it does not.
- *
- * @param {any} pose XRPose of the ray
- */
+/** Return where a hand's ray starts and reaches the floor; null if it does not. @param {any} pose XRPose */
 function rayOf(pose) {
   if (!pose) return null;
   const m = pose.transform.matrix, from = [m[12], m[13], m[14]], along = [-m[8], -m[9], -m[10]];

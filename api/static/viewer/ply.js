@@ -28,10 +28,7 @@ const TEXT = "format ascii 1.0";
 /** Maximum bytes of a header, and of a line of text. */
 const LONGEST_HEADER = 1 << 16;
 
-/**
- * @param {ByteReader} reader reader at the start of a PLY; after the call, behind its header
- * @returns {Promise<Header>}
- */
+/** @param {ByteReader} reader at the start of a PLY; later behind its header @returns {Promise<Header>} */
 export async function readHeader(reader) {
   for (let size = 4096; ; size *= 2) {
     const text = new TextDecoder("latin1").decode(await reader.peek(size));
@@ -112,13 +109,7 @@ async function* textLines(reader) {
   }
 }
 
-/**
- * Return the numbers of the next lines, which are rows.
- *
- * @param {AsyncGenerator<string>} written
- * @param {number} count
- * @param {number} width
- */
+/** Return the next rows. @param {AsyncGenerator<string>} written @param {number} count @param {number} width */
 async function numbers(written, count, width) {
   const rows = new Float32Array(count * width);
   for (let row = 0; row < count; row++) {
@@ -183,11 +174,7 @@ const BOUNDS = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
 /** Values of the bytes of spherical harmonics. */
 const STEPS = Float32Array.from({ length: 256 }, (_, i) => (i === 0 ? -4 : i === 255 ? 4 : (i + 0.5) / 32 - 4));
 
-/**
- * @param {ByteReader} reader reader behind the header
- * @param {Header} header
- * @returns {SceneFile}
- */
+/** @param {ByteReader} reader reader behind the header @param {Header} header @returns {SceneFile} */
 export function compressedPly(reader, { elements, comments }) {
   const [chunk, vertex, sh] = elements, rest = sh ? Object.keys(sh.columns).length : 0;
   const wrong = chunk.name !== "chunk" || !chunk.little || vertex?.name !== "vertex" || !(vertex.count > 0) || vertex.stride !== 16

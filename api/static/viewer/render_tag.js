@@ -13,11 +13,7 @@ const MODE = /^splatrendermode:\s*(mip|default|2dgs)\s*$/i;
 const FLAG = /^(?:antialiased\s+|fvdb_ply_\w+antialias\|int64\|)([01])\s*$/i;
 const BLUR = /^(?:eps2d\s+|fvdb_ply_\w+eps2d\|double\|)([\d.eE+-]+)\s*$/i;
 
-/**
- * @param {string[]} comments comments of a PLY; the last one counts
- * @param {string[]} names properties of its Gaussians
- * @returns {Rendering}
- */
+/** @param {string[]} comments the last one counts @param {string[]} names those of properties @returns {Rendering} */
 export function plyRendering(comments, names) {
   const filtered = names.includes("filter_3D"), flat = isFlat(names);
   /** @type {boolean | null} */
@@ -41,11 +37,7 @@ export function extrasRendering(extras) {
   return { antialiased: extras?.model === "antialiased", eps2d: eps2d ?? EPS2D };
 }
 
-/**
- * Return whether properties are those of 2D Gaussian Splatting, whose Gaussians have no third axis.
- *
- * @param {string[]} names
- */
+/** Return whether properties are those of 2DGS, whose Gaussians have no third axis. @param {string[]} names */
 export const isFlat = (names) => names.includes("scale_1") && !names.includes("scale_2") && !names.includes("scale");
 
 /**

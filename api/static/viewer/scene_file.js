@@ -1,7 +1,5 @@
 // @ts-check
-/**
- * Scenes of any format, detected from the file's content: batches of float32 rows, with the names of PLY properties.
- */
+/** Scenes of any format, detected from their content: batches of float32 rows, with names of PLY properties. */
 import { ByteReader, SceneError } from "./byte_reader.js";
 import { glb } from "./glb.js";
 import { isKsplat, isSplat, ksplat, splat } from "./splat.js";

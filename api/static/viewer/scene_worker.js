@@ -58,12 +58,7 @@ async function opened(source) {
   return [answer.body, answer.headers.has("content-encoding") ? 0 : Number(answer.headers.get("content-length") ?? 0)];
 }
 
-/**
- * Return the highest SH degree whose textures fit into memory.
- *
- * @param {SceneFile} file
- * @param {{texels: number, bytes: number}} room
- */
+/** Return the highest SH degree that fits. @param {SceneFile} file @param {{texels: number, bytes: number}} room */
 function keptDegree(file, { texels, bytes }) {
   const fits = (/** @type {number} */ d) => {
     const each = harmonicTexels(d);

@@ -63,23 +63,14 @@ export class Selector {
     this.ids = new Uint32Array(0);
   }
 
-  /**
-   * Apply a change, and return what the page needs to show it.
-   *
-   * @param {any} request `op` is one of the methods below that take a request
-   */
+  /** Apply a change, and return what the page shows. @param {any} request `op`: a method below that takes a request */
   answer(request) {
     const flips = request.op === "bits" ? [] : request.op === "view" ? this.setView(request) : this.change(request);
     const counts = { total: this.total, past: this.past.length, future: this.future.length };
     return { ...this.range(flips), ...counts, ...(request.op === "bits" ? { bits: this.bits() } : {}) };
   }
 
-  /**
-   * Change flags, and return the lists of flips.
-   *
-   * @param {any} request `replaces`: whether the last change is undone first
-   * @returns {Uint32Array[]}
-   */
+  /** Change flags, and return lists of flips. @param {any} request `replaces`: undo the last change first */
   change(request) {
     if (request.op === "undo") return [this.move(this.past, this.future)];
     if (request.op === "redo") return [this.move(this.future, this.past)];
@@ -220,11 +211,7 @@ export class Selector {
     return this.changing(mode, (i) => x[i] >= left && x[i] <= right && y[i] >= top && y[i] <= bottom && (through || visible[i] === 1) && near(x[i], y[i]));
   }
 
-  /**
-   * Return the Gaussians inside a polygon of the view.
-   *
-   * @param {{points: number[], mode: Mode, through: boolean}} request
-   */
+  /** Return those inside a polygon. @param {{points: number[], mode: Mode, through: boolean}} request */
   lasso({ points, mode, through }) {
     const { x, y, visible, width, height } = this, inside = filled(points, width, height);
     return this.changing(mode, (i) => x[i] >= 0 && y[i] >= 0 && x[i] < width && y[i] < height && (through || visible[i] === 1) && inside[Math.floor(y[i]) * width + Math.floor(x[i])] === 1);
@@ -303,17 +290,12 @@ const AROUND = STEPS.flatMap((z) => STEPS.flatMap((y) => STEPS.map((x) => x + KE
 
 /** Grid of cells over the centers of a scene's Gaussians, for searches among neighbors. */
 class CellGrid {
-  /**
-   * @param {Float32Array} centers [n * 3]
-   * @param {number} count
-   * @param {number} radius radius of the bulk of the scene
-   */
+  /** @param {Float32Array} centers [n * 3] @param {number} count @param {number} radius that of the scene's bulk */
   constructor(centers, count, radius) {
     this.centers = centers;
     this.count = count;
     /** Side of a cell, which is about twice the distance between neighbors on a surface. */
     this.side = Math.max((7 * radius) / Math.sqrt(Math.max(count, 1)), 1e-9);
-    /** Cell of each Gaussian. */
     this.cellOf = new Uint32Array(count);
     /** Numbers of cells by key. @type {Map<number, number>} */
     this.cells = new Map();
@@ -350,7 +332,6 @@ class CellGrid {
     }
   }
 
-  /** List the Gaussians cell by cell. */
   sort() {
     const { cellOf, count, items } = this, starts = new Uint32Array(this.keys.length + 1);
     for (let i = 0; i < count; i++) starts[cellOf[i] + 1]++;

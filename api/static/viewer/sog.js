@@ -138,13 +138,7 @@ function codebook({ codebook: values }, channels) {
   return Array(channels).fill(numbers);
 }
 
-/**
- * Return the values of each byte in version 1, by channel.
- *
- * @param {any} entry
- * @param {number} channels
- * @returns {Float32Array[]}
- */
+/** Return the values of each byte in version 1, by channel. @param {any} entry @param {number} channels */
 function steps({ mins, maxs }, channels) {
   const low = [mins].flat(), high = [maxs].flat();
   return Array.from({ length: channels }, (_, c) => Float32Array.from({ length: 256 }, (_, i) => low[c] + (high[c] - low[c]) * (i / 255)));

@@ -62,11 +62,7 @@ const MIN_SCALE = -25 * Math.LN2;
  * @property {number} steps steps from the least position in a bucket to its center
  */
 
-/**
- * Return whether bytes look like a header: the format has no magic number beyond its version, 0.1.
- *
- * @param {Uint8Array} start
- */
+/** Return whether bytes look like a header, which has no magic number beyond a version. @param {Uint8Array} start */
 export function isKsplat(start) {
   const view = new DataView(start.buffer, start.byteOffset, start.length);
   if (start.length < HEADER || view.getUint32(0) !== 0x00010000) return false;

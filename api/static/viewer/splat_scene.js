@@ -6,6 +6,7 @@ import { words } from "../words.js";
 /** @typedef {{center: number[], radius: number, low: number[], high: number[]}} Middle */
 /** @typedef {{count: number, degree: number, size: number, rendering: import("./render_tag.js").Rendering, front?: number[]}} Shown values of a file's header */
 
+/** @typedef {import("./depth_order.js").Pose} Pose */
 /** @typedef {Error & {cut: boolean}} SceneFailure `cut`: whether the file ends too early */
 
 /** Direction from which a scene is seen first: that of the cameras that its own axes suggest. */
@@ -156,12 +157,7 @@ export class SplatScene {
     return new Promise((done) => this.centers.push(done));
   }
 
-  /**
-   * Request a depth order, unless one is being computed.
-   *
-   * @param {import("./depth_order.js").Pose} pose
-   * @param {number} number number of the pose
-   */
+  /** Request a depth order, unless one is being computed. @param {Pose} pose @param {number} number that of the pose */
   sort(pose, number) {
     if (this.busy || !this.loaded) return;
     this.busy = true;
@@ -183,7 +179,6 @@ export class SplatScene {
     this.sortedFor = number;
   }
 
-  /** Free all resources. */
   end() {
     this.worker.terminate();
     const { gl } = this;

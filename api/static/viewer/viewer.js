@@ -20,7 +20,6 @@ export class Viewer {
   /** The scene bounds that the camera was last set to show. @type {SplatScene["middle"]} */
   framed = null;
 
-  /** Function that is called after each change of the state. */
   told = () => {};
 
   /** @param {HTMLCanvasElement} canvas */
@@ -115,46 +114,34 @@ export class Viewer {
     this.draw();
   }
 
-  /** Request a frame. */
   draw() {
     this.settled = false;
     this.canvas.dataset.state = "drawing";
-    if (!this.requested && !this.ended) this.requested = requestAnimationFrame(() => this.step());
+    if (!this.requested && !this.ended) this.later();
   }
 
+  later() {
+    this.requested = requestAnimationFrame(() => this.step());
+  }
+
+  /** Draw a frame once the last one is finished, or stop if that one shows everything. */
   step() {
     this.requested = 0;
     if (this.lost || this.ended || this.headset) return;
-    if (this.fence && !this.finished()) {
-      this.requested = requestAnimationFrame(() => this.step());
-      return;
+    if (!this.finished()) return this.later();
+    if (this.settled) {
+      this.canvas.dataset.state = this.sides?.left.scene.whole && this.sides.right.scene.whole ? "settled" : "loading";
+      return this.told();
     }
-    const moving = performance.now() - this.movedAt < STILL;
-    const scale = moving ? this.movingScale : 1;
     const again = this.askForOrder();
-    this.scale = scale;
+    this.scale = performance.now() - this.movedAt < STILL ? this.movingScale : 1;
     this.painter.render();
     this.begun = performance.now();
     this.fence = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     this.gl.flush();
     this.frames++;
-    this.settled = !again && scale === 1 && this.sides !== null;
-    if (!this.sides) return;
-    this.requested = requestAnimationFrame(() => (this.settled ? this.settle() : this.step()));
-  }
-
-  /** Wait until the last frame is finished, then stop. */
-  settle() {
-    this.requested = 0;
-    if (this.lost || this.ended) return;
-    if (!this.settled) return void (this.requested = requestAnimationFrame(() => this.step()));
-    if (!this.finished()) {
-      this.requested = requestAnimationFrame(() => this.settle());
-      return;
-    }
-    const { left, right } = /** @type {{left: Side, right: Side}} */ (this.sides);
-    this.canvas.dataset.state = left.scene.whole && right.scene.whole ? "settled" : "loading";
-    this.told();
+    this.settled = !again && this.scale === 1 && this.sides !== null;
+    if (this.sides) this.later();
   }
 
   /** Return whether a frame now would leave the machine little time for other work, such as the job that is watched. */
@@ -249,7 +236,6 @@ export class Viewer {
   /** @type {((sides: {left: Side, right: Side}) => void) | undefined} */
   onReload;
 
-  /** Free all resources. */
   end() {
     this.ended = true;
     cancelAnimationFrame(this.requested);
