@@ -149,12 +149,7 @@ export function cameraLines(cameras, size) {
   }));
 }
 
-/**
- * Return the size for the frames of cameras around a scene, in world units.
- *
- * @param {JobCamera[]} cameras
- * @param {{center: Vector, radius: number} | null} middle
- */
+/** Return the size of frames, world units. @param {JobCamera[]} cameras @param {{center: Vector} | null} middle */
 export function frameSize(cameras, middle) {
   if (!cameras.length) return 1;
   const away = cameras.map(({ position }) => Math.hypot(...difference(position, middle?.center ?? [0, 0, 0]))).sort((a, b) => a - b);

@@ -34,7 +34,7 @@ export class CropPanel {
     this.remove = button(say.remove, () => this.use(""));
     this.first = button(say.use, () => this.use(this.tool.shape ? boxText(this.tool.shape) : ""), "primary");
     this.tool = new ShapeTool(stage, (lines) => this.draw(lines));
-    this.element = h("section.selecting", { hidden: true, "aria-label": say.crop }, h("p.help", say.help), h("div.row", this.tool.numbers), h("div.row", this.remove, h("span.spring"), button(words.select.cancel, () => this.close()), this.first));
+    this.element = h("section.selecting", { hidden: true, "aria-label": say.crop }, h("p.help", say.help), h("div.row", this.tool.numbers), h("div.row", this.remove, h("span.grow"), button(words.select.cancel, () => this.close()), this.first));
     this.element.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && (this.close(), this.button.focus()));
     stage.tools.prepend(this.button);
     stage.element.append(this.element);

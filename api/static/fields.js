@@ -35,14 +35,7 @@ export function check(name, checked = false) {
 
 const say = words.job;
 
-/**
- * Create a button that asks for confirmation.
- *
- * @param {string} name
- * @param {() => Promise<void>} act
- * @param {(error: unknown) => void} failed
- * @param {string} [label]
- */
+/** @param {string} name @param {() => Promise<any>} act @param {(error: any) => void} failed @param {string} [label] */
 export function deleteButton(name, act, failed, label) {
   const holder = h("span.sure");
   const first = h("button.quiet.danger", { type: "button", onclick: () => ask_(), "aria-label": label ?? name }, label ? icon("bin") : name);

@@ -40,11 +40,7 @@ export function factsCard(job) {
 }
 
 export class JobName {
-  /**
-   * @param {string} id id of the job
-   * @param {(job: any) => void} renamed receives the job after it was renamed
-   * @param {(error: unknown) => void} failed
-   */
+  /** @param {string} id @param {(job: any) => void} renamed @param {(error: unknown) => void} failed */
   constructor(id, renamed, failed) {
     this.id = id;
     this.renamed = renamed;
@@ -198,10 +194,7 @@ async function copy(input) {
 }
 
 export class VideoCard {
-  /**
-   * @param {any} job
-   * @param {AbortSignal} signal aborted when the page leaves the job; the service completes the video nevertheless
-   */
+  /** @param {any} job @param {AbortSignal} signal aborted when the page leaves the job; its video is completed */
   constructor(job, signal) {
     this.job = job;
     this.shown = "";

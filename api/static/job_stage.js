@@ -71,12 +71,7 @@ export class JobStage {
     if (!this.preview && !this.result) put(this.picture, h("p.quiet", text));
   }
 
-  /**
-   * Show the scene of an unfinished job: alone, then beside its colors so far, or those that it continues from.
-   *
-   * @param {any} job
-   * @param {Set<string>} names names of the job's files
-   */
+  /** Show the scene of an unfinished job, then its colors. @param {any} job @param {Set<string>} names its files */
   showLive(job, names) {
     const ownScene = names.has("live/scene.ply"), painted = [LIVE, "colors.f16"].find((name) => names.has(name)) ?? "", { live: before } = this;
     if (this.result || this.finishing || GONE.has(job.status)) return;
@@ -106,12 +101,7 @@ export class JobStage {
     if (first && live?.live?.painted) this.open(0);
   }
 
-  /**
-   * Show the result, in the stage that has shown the job while it ran if there is one.
-   *
-   * @param {any} job
-   * @param {boolean} hasSheet whether there is an image of views before and after
-   */
+  /** Show the result, where the running job was shown. @param {any} job @param {boolean} hasSheet before and after */
   async finish(job, hasSheet) {
     if (this.finishing) return;
     this.finishing = true;

@@ -141,7 +141,13 @@ export class CompareView {
       const jobs = await Promise.all(this.ids.map((id) => get(`v1/jobs/${id}`, this.leaving.signal)));
       this.show(jobs);
       if (jobs.some((job) => UNFINISHED.has(job.status))) this.timer = later(() => this.load(), OFTEN, this.leaving.signal);
-      else this.showStage(jobs.filter((job) => job.status === "succeeded"));
+      else {
+        const finished = jobs.filter((job) => job.status === "succeeded");
+        if (!finished.length) throw new Error(words.compare.notThere);
+        this.stage = new ResultStage(finished, { signal: this.leaving.signal });
+        this.stage.stage.title = labels(finished).join(" ");
+        put(this.holder, this.stage.element);
+      }
     } catch (error) {
       if (this.leaving.signal.aborted) return;
       const gone = error instanceof Problem && error.status === 404;
@@ -157,14 +163,6 @@ export class CompareView {
     const focused = [...this.sheet.querySelectorAll("a")].indexOf(/** @type {any} */ (document.activeElement));
     put(this.sheet, jobs.map((job, i) => tile(job, names[i], { alt: words.job.sheetOf(names[i]) })));
     if (focused >= 0) this.sheet.querySelectorAll("a")[focused]?.focus();
-  }
-
-  /** @param {any[]} jobs finished runs */
-  showStage(jobs) {
-    if (!jobs.length) throw new Error(words.compare.notThere);
-    this.stage = new ResultStage(jobs, { signal: this.leaving.signal });
-    this.stage.stage.title = labels(jobs).join(" ");
-    put(this.holder, this.stage.element);
   }
 
   end() {

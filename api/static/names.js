@@ -6,12 +6,7 @@ import { time, words } from "./words.js";
 /** @param {string} name @returns {string} name of an image without its suffix */
 const stem = (name) => name.replace(/\.[^.]*$/, "");
 
-/**
- * Return the name that the service gives to a job without one; without styles, that of the scene.
- *
- * @param {string | undefined} scene name of the scene's file
- * @param {string[]} styles names of the style images
- */
+/** Return a job's default name, or the scene's. @param {string | undefined} scene @param {string[]} styles names */
 export function defaultName(scene, styles) {
   if (!scene) return "";
   const suffix = sceneSuffix(scene), plain = suffix ? scene.slice(0, -suffix.length) : stem(scene);

@@ -33,12 +33,7 @@ export class OptionsPart {
     this.expertFold = h("details.fold.group", h("summary", say.expertOptions), h("p.help", say.expertHint), this.expert);
   }
 
-  /**
-   * Make the controls that the API's document describes.
-   *
-   * @param {AbortSignal} signal
-   * @param {(schema: any) => void} restore called before the controls are shown with their pictures
-   */
+  /** Make the controls. @param {AbortSignal} signal @param {(schema: any) => void} restore called before they show */
   async load(signal, restore) {
     let schema;
     try {
@@ -53,7 +48,11 @@ export class OptionsPart {
     for (const [name, each] of Object.entries(schema)) {
       if (!ELSEWHERE.includes(name)) this.controls.set(name, optionControl(name, each, name === "orbit" ? { title: say.howMany } : {}));
     }
-    this.makePresets(schema.preset);
+    const group = newId(), { default: usual, enum: presets } = schema.preset;
+    this.follow(usual);
+    put(this.presets, h("legend", say.preset), presets.map((/** @type {string} */ value) => h("label",
+      h("input", { type: "radio", name: group, value, checked: value === usual, onchange: () => this.follow(value) }),
+      h("span", h("strong", value), h("small", say.presets[value] ?? "")))));
     const { Essentials, Views, Look, Expert } = this.groups;
     for (const [place, names] of /** @type {[HTMLElement, string[]][]} */ ([[this.main, Essentials], [this.ring, Views], [this.look, Look], [this.expert, [...Expert, "retention_days"]]])) {
       put(place, names.map((name) => this.controls.get(name)?.element));
@@ -63,15 +62,6 @@ export class OptionsPart {
     this.controls.get("within")?.element.addEventListener("input", () => this.preset && this.follow(this.preset));
     restore(schema);
     followStrength();
-  }
-
-  /** @param {any} schema */
-  makePresets(schema) {
-    const name = newId();
-    this.follow(schema.default);
-    put(this.presets, h("legend", say.preset), schema.enum.map((/** @type {string} */ value) => h("label",
-      h("input", { type: "radio", name, value, checked: value === schema.default, onchange: () => this.follow(value) }),
-      h("span", h("strong", value), h("small", say.presets[value] ?? "")))));
   }
 
   /** Choose a preset, unless the service does not have it. @param {string} preset */

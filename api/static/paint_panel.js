@@ -48,7 +48,7 @@ export class PaintPanel {
     this.wrong = h("p.wrong", { hidden: true, role: "alert" });
     this.element = h("section.selecting", { hidden: true, "aria-label": say.title }, h("div.row", h("h2", say.title)), h("p.help", say.help),
       h("div.row", h("label.check", this.color, h("span", say.color)), this.size.element, this.undo),
-      h("div.row", button(say.download, () => this.download()), button(say.use, () => this.file.click()), this.file, h("span.spring"), h("div.row", this.back, this.apply)), this.wrong, this.submission.element);
+      h("div.row", button(say.download, () => this.download()), button(say.use, () => this.file.click()), this.file, h("span.grow"), h("div.row", this.back, this.apply)), this.wrong, this.submission.element);
     stage.tools.querySelector(".buttons")?.prepend(this.button);
     stage.element.append(this.element);
     leaving.addEventListener("abort", () => this.submission.end());

@@ -38,14 +38,7 @@ async function fileOf(canvas, name) {
   return new File([blob], isJpeg || /\.png$/i.test(name) ? name : `${name.replace(/\.[^.]*$/, "")}.png`, { type });
 }
 
-/**
- * Let the user rotate and crop a painting.
- *
- * @param {Blob} blob
- * @param {string} name
- * @returns {Promise<File | null>} null if it stays as it is
- * @throws {Error} if the browser cannot read the image
- */
+/** Let the user rotate and crop a painting; null if it stays as it is. @param {Blob} blob @param {string} name */
 export async function editPainting(blob, name) {
   const image = await createImageBitmap(blob).catch(() => {
     throw new Error(say.unreadable(name));

@@ -8,10 +8,7 @@ const say = words.plan;
 /** Seconds above which something faster is offered. */
 const LONG = 3600;
 
-/**
- * @param {any} view answer to a dry run
- * @param {(() => void) | null} [hurry] called when the user prefers a time budget to a long job; null offers none
- */
+/** @param {any} view answer to a dry run @param {(() => void) | null} [hurry] prefers a time budget to a long job */
 export function costCard(view, hurry = null) {
   const figure = (/** @type {string} */ name, /** @type {string} */ value, note = "") => h("div", h("dt", name), h("dd", value, note && h("small", note)));
   return h("section.card.cost", { "aria-label": say.title }, h("h2", say.title),

@@ -173,12 +173,7 @@ export class RegionList {
     }
   }
 
-  /**
-   * Show a refusal in the region that caused it. Return whether one did.
-   *
-   * @param {string} at path of the refused parameter, such as "regions.0.select"
-   * @param {string} message
-   */
+  /** Show a refusal in the region that caused it; return whether one did. @param {string} at @param {string} message */
   refuse(at, message) {
     const [, number, field] = /\bregions\.(\d+)(?:\.(\w+))?/.exec(at) ?? [];
     const named = (/** @type {Row} */ row) => ["'", '"'].some((quote) => message.includes(`egion ${quote}${row.value().name}${quote}`));

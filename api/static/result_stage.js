@@ -178,12 +178,7 @@ export class ResultStage {
     this.fetching = undefined;
   }
 
-  /**
-   * Show the result of the run, which has just finished, without loading the scene again.
-   *
-   * @param {any} job
-   * @returns {Promise<boolean>} whether that is possible
-   */
+  /** Show the result without loading the scene again. Return whether that is possible. @param {any} job */
   async finish(job) {
     const { original, live } = this;
     if (!original || live?.ownScene || job.parameters.sh_attenuation) return false;

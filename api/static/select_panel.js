@@ -68,7 +68,7 @@ export class SelectPanel {
       h("div.row", this.parts.toolRadios, this.parts.modeRadios), this.parts.toolHelp,
       h("div.row", this.parts.radius.element, this.parts.through.element, this.parts.tolerance.element, this.parts.connected.element, this.parts.middle, this.shapes.numbers, this.parts.apply),
       h("div.row", this.parts.undo, this.parts.redo, button(say.invert, () => this.ask("invert")), button(say.clear, () => this.ask("clear")),
-        h("span.spring"), button(say.cancel, () => this.close(null)), button(say.done, () => this.done(), "primary")));
+        h("span.grow"), button(say.cancel, () => this.close(null)), button(say.done, () => this.done(), "primary")));
     this.choose("move");
   }
 

@@ -4,6 +4,7 @@ import { h, put } from "./dom.js";
 import { difference, dot, sum, times } from "./viewer/vectors.js";
 import { words } from "./words.js";
 
+/** @typedef {import("./stage.js").Stage} Stage */
 /** @typedef {import("./viewer/viewer.js").Viewer} Viewer */
 /** @typedef {import("./viewer/vectors.js").Vector} Vector */
 /** @typedef {{kind: "box" | "sphere", center: Vector, sizes: Vector}} Shape `sizes`: half of the sides of a box, or the radius of a sphere three times */
@@ -37,10 +38,7 @@ export function outline({ kind, center, sizes }) {
 }
 
 export class ShapeTool {
-  /**
-   * @param {import("./stage.js").Stage} stage
-   * @param {(lines: Float32Array<ArrayBuffer>) => void} draw receives the outline, as pairs of points; empty for none
-   */
+  /** @param {Stage} stage @param {(lines: Float32Array<ArrayBuffer>) => void} draw receives pairs of points */
   constructor(stage, draw) {
     this.stage = stage;
     this.draw = draw;
@@ -89,14 +87,7 @@ export class ShapeTool {
     });
   }
 
-  /**
-   * Return a handle that moves one side of a box, or resizes a sphere.
-   *
-   * @param {Shape} shape
-   * @param {Viewer} viewer
-   * @param {number} axis
-   * @param {number} sign
-   */
+  /** Return a resizing handle. @param {Shape} shape @param {Viewer} viewer @param {number} axis @param {number} sign */
   sizing(shape, viewer, axis, sign) {
     const direction = times(AXES[axis], sign), place = () => sum(shape.center, times(direction, shape.sizes[axis]));
     return this.handle(say.resize(["X", "Y", "Z"][axis], sign), viewer, place, (dx, dy, unit) => {

@@ -192,12 +192,7 @@ const LARGE = 5e7;
 const MODEL = /^(cameras|images|points3D|frames|rigs)[^/]*\.(bin|txt)$/i;
 const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp|heic|heif|hif)$/i;
 
-/**
- * Sort dropped files into slots. Up to four images are styles; more are photos.
- *
- * @param {File[]} files
- * @returns {{scene: File[], style: File[], cameras: File[], photos: File[], unknown: File[]}}
- */
+/** Sort dropped files into slots. Up to four images are styles; more are photos. @param {File[]} files */
 export function sorted(files) {
   const pictures = files.filter((file) => PICTURE.test(file.name)), many = pictures.length > 4;
   const [scene, ...others] = files.filter((file) => sceneSuffix(file.name));

@@ -181,10 +181,7 @@ export class Stage {
     announce(this.names[this.share ? 0 : 1]);
   }
 
-  /**
-   * @param {JobCamera[]} cameras
-   * @param {{frames?: boolean, stand?: boolean}} [how] `frames`: draw them in the scene; `stand`: move to the first one
-   */
+  /** @param {JobCamera[]} cameras @param {{frames?: boolean, stand?: boolean}} [how] draw them; move to the first */
   setCameras(cameras, { frames = false, stand = false } = {}) {
     this.cameras = cameras;
     if (!this.viewer) return;

@@ -10,10 +10,7 @@ import { percent, size, words } from "./words.js";
 /** @typedef {File | StoredFile} Chosen file of a form: on this device, or on the service */
 
 export class StoredFile {
-  /**
-   * @param {string} path path of the input in the API, without the leading slash that a new job refers to it by
-   * @param {{name: string, size: number, sha256: string}} input
-   */
+  /** @param {string} path in the API, no leading slash @param {{name: string, size: number, sha256: string}} input */
   constructor(path, { name, size, sha256 }) {
     this.path = path;
     this.name = name;
@@ -38,12 +35,7 @@ export function storedInputs(job) {
   return found;
 }
 
-/**
- * Return the inputs of a job by role, with all photos and masks, whose names the job itself does not have.
- *
- * @param {any} job
- * @returns {Promise<Record<string, StoredFile[]>>}
- */
+/** Return all inputs by role; the job itself lacks the names of photos and masks. @param {any} job */
 async function allInputs(job) {
   if (!job.input_counts.photos && !job.input_counts.mask) return storedInputs(job);
   const inputs = [];

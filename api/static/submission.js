@@ -48,11 +48,7 @@ export class Submission {
     for (const upload of this.sending) upload.stop();
   }
 
-  /**
-   * Upload the files that the service lacks, and return the addresses of all files by role, for a job's body.
-   *
-   * @param {Record<string, Chosen[]>} files
-   */
+  /** Upload what the service lacks; return all addresses by role. @param {Record<string, Chosen[]>} files */
   async send(files) {
     const all = /** @type {File[]} */ (Object.values(files).flat().filter((file) => !(file instanceof StoredFile)));
     for (const file of all) if (!this.uploads.has(file)) this.uploads.set(file, new Upload(file, () => this.show()));
@@ -64,12 +60,7 @@ export class Submission {
     return Object.fromEntries(Object.entries(files).map(([role, chosen]) => [role, named(chosen)]));
   }
 
-  /**
-   * Return the plan of a job.
-   *
-   * @param {any} body
-   * @returns {Promise<any>} undefined if the service did not send one, or if `stopPlanning` was called
-   */
+  /** Return a plan; undefined if `stopPlanning` was called. @param {any} body @returns {Promise<any>} */
   async plan(body) {
     this.tell(say.planning);
     const signal = AbortSignal.any([this.leaving, this.stopping.signal]), headers = { Accept: "text/event-stream" };

@@ -21,12 +21,7 @@ export function directionOf(text = "") {
 /** Return the value of the option `up` for a direction; undefined if there is none. @param {Vector} up */
 export const upName = (up) => Object.keys(UPS).find((name) => dot(UPS[name], up) > 0.999);
 
-/**
- * Return the up direction after a quarter turn.
- *
- * @param {Vector} up up direction before
- * @param {Vector} wanted direction that becomes up, as nearly as the axes allow
- */
+/** Return the axis nearest to a direction, of those across. @param {Vector} up @param {Vector} wanted */
 function turnedUp(up, wanted) {
   const across = Object.entries(UPS).filter(([, axis]) => Math.abs(dot(axis, up)) < 0.5);
   return across.reduce((best, each) => (dot(each[1], wanted) > dot(best[1], wanted) ? each : best))[0];

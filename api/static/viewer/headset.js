@@ -89,18 +89,13 @@ export class Headset {
     const seconds = this.last ? Math.min((time - this.last) / 1000, 0.1) : 0, pose = frame.getViewerPose(this.space);
     this.last = time;
     if (!pose || !viewer.sides || viewer.lost) return;
-    this.holdRate(seconds);
+    if (seconds > SLOW) this.scale = Math.max(LEAST_SCALE, this.scale - SCALE_STEP);
+    else if (seconds && seconds < FAST) this.scale = Math.min(1, this.scale + SCALE_STEP / 20);
     this.move(frame, pose, seconds);
     const eyes = pose.views.map((/** @type {any} */ view) => this.eye(view));
     this.sort(eyes);
     viewer.painter.renderEyes(this.layer, eyes, this.sides(), this.scale, this.lines(), this.mode === "immersive-ar");
     viewer.frames++;
-  }
-
-  /** Reduce the pixels of slow frames. @param {number} seconds */
-  holdRate(seconds) {
-    if (seconds > SLOW) this.scale = Math.max(LEAST_SCALE, this.scale - SCALE_STEP);
-    else if (seconds && seconds < FAST) this.scale = Math.min(1, this.scale + SCALE_STEP / 20);
   }
 
   /** Return the camera of an eye in the scene, with its part of the frame. @param {any} view XRView */

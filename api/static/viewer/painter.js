@@ -147,11 +147,7 @@ export class Painter {
     gl.clear(gl.COLOR_BUFFER_BIT);
   }
 
-  /**
-   * @param {{left: Side, right: Side}} sides
-   * @param {number} share fraction of the width that shows the left side
-   * @param {number[]} viewport x, y, width and height in pixels
-   */
+  /** @param {{left: Side, right: Side}} sides @param {number} share see `Viewer.cut` @param {number[]} viewport */
   splats({ left, right }, share, [x, y, width, height]) {
     const { gl } = this, cut = Math.round(share * width);
     gl.enable(gl.BLEND);

@@ -45,11 +45,7 @@ export async function readHeader(reader) {
   }
 }
 
-/**
- * @param {Header} header
- * @param {number} size size of the file in bytes; 0 if unknown
- * @throws {CutError} if the file is shorter than its header states
- */
+/** @param {Header} header @param {number} size bytes; 0 if unknown @throws {CutError} if the file is shorter */
 export function checkLength({ begin, elements, text }, size) {
   if (text) return; // the length of a line is not known
   const declared = elements.reduce((sum, { count, stride }) => sum + count * stride, begin);
@@ -152,12 +148,7 @@ function withoutThickness(rows, width) {
   return found;
 }
 
-/**
- * Return rows as float32, converted from the types in which they are stored.
- *
- * @param {Element} element
- * @param {Uint8Array} bytes whole rows, at the start of their buffer
- */
+/** Return rows as float32. @param {Element} element @param {Uint8Array} bytes at the start of their buffer */
 function floats({ stride, columns, little }, bytes) {
   const all = Object.values(columns);
   if (little && all.every(({ type }) => type === "float" || type === "float32")) return new Float32Array(bytes.buffer, 0, bytes.length / 4);

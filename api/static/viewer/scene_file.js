@@ -19,12 +19,7 @@ import { words } from "../words.js";
  * @property {() => AsyncGenerator<Float32Array>} batches `BATCH` rows each, fewer in the last one
  */
 
-/**
- * @param {ByteReader} reader
- * @param {number} size size of the file in bytes; 0 if unknown
- * @returns {Promise<SceneFile>}
- * @throws {SceneError}
- */
+/** @param {ByteReader} reader @param {number} size bytes; 0 if unknown @returns {Promise<SceneFile>} */
 export async function openScene(reader, size) {
   const start = await reader.peek(4096), magic = String.fromCharCode(...start.subarray(0, 4));
   if (magic.startsWith("ply")) {

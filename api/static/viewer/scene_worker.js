@@ -33,10 +33,7 @@ port.onmessage = async (/** @type {MessageEvent} */ { data }) => {
   }
 };
 
-/**
- * @param {File | string} source
- * @param {{texels: number, bytes: number}} room maximum texels of a texture, and maximum bytes of all textures
- */
+/** @param {File | string} source @param {{texels: number, bytes: number}} room of a texture, and of all textures */
 async function load(source, room) {
   const [stream, size] = await opened(source), reader = new ByteReader(stream);
   const file = await openScene(reader, size);
@@ -84,11 +81,7 @@ function give(rows, file) {
     [geometry.buffer, packed.colors.buffer, harmonics.buffer]);
 }
 
-/**
- * Return center and radius of the bulk of the Gaussians, without outliers and background.
- *
- * @returns {{center: number[], radius: number, low: number[], high: number[]}}
- */
+/** Return the bounds of the Gaussians without outliers. @returns {import("./splat_scene.js").Middle} */
 function middle() {
   const step = Math.max(1, Math.floor(count / 20000));
   /** @type {number[]} */

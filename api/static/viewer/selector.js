@@ -19,13 +19,7 @@ const SURFACE = 0.75, THICKNESS = 0.6;
 /** Maximum number of stored flips of all changes that can be undone. */
 const MOST_FLIPS = 5e7;
 
-/**
- * Return the colors of rows as bytes, [n * 3].
- *
- * @param {Float32Array} rows
- * @param {number} width values of a row
- * @param {Record<string, number>} at index of each value in a row
- */
+/** Return colors as bytes. @param {Float32Array} rows @param {number} width @param {Record<string, number>} at */
 export function rgbOf(rows, width, at) {
   const count = rows.length / width, found = new Uint8ClampedArray(count * 3), places = [at.f_dc_0, at.f_dc_1, at.f_dc_2];
   for (let i = 0; i < count; i++) for (let c = 0; c < 3; c++) found[3 * i + c] = 255 * (0.5 + SH_C0 * rows[i * width + places[c]]);
@@ -192,11 +186,7 @@ export class Selector {
     return found;
   }
 
-  /**
-   * Return the Gaussians under a brush.
-   *
-   * @param {{points: number[], radius: number, mode: Mode, through: boolean}} request `points`: x and y of each, in pixels
-   */
+  /** @param {{points: number[], radius: number, mode: Mode, through: boolean}} request `points`: x and y of each */
   stroke({ points, radius, mode, through }) {
     const { x, y, visible } = this, xs = points.filter((_, k) => !(k & 1)), ys = points.filter((_, k) => k & 1);
     const left = Math.min(...xs) - radius, right = Math.max(...xs) + radius, top = Math.min(...ys) - radius, bottom = Math.max(...ys) + radius;

@@ -11,6 +11,7 @@ import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, setRotation, unpac
 import { extrasRendering } from "./render_tag.js";
 import { words } from "../words.js";
 
+/** @typedef {import("./byte_reader.js").Files} Files */
 /** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
 /** SH coefficients per color channel by the width of the palette's image, which has 64 vectors in a row. */
@@ -39,12 +40,7 @@ export async function sog(reader) {
   return { ...joined(index === undefined ? [await sogPart(files)] : await finestParts(files, index)), front: SUPERSPLAT };
 }
 
-/**
- * Return the parts of the finest level of a streamed SOG, and its environment.
- *
- * @param {import("./byte_reader.js").Files} files
- * @param {string} name path of its index
- */
+/** Return the parts of the finest level, and the environment. @param {Files} files @param {string} name of the index */
 async function finestParts(files, name) {
   const above = name.slice(0, -INDEX.length), { filenames, environment, tree } = await json(files, name);
   const used = /** @type {Map<number, Set<number>>} */ (new Map());
@@ -61,7 +57,7 @@ async function finestParts(files, name) {
   return parts;
 }
 
-/** @param {import("./byte_reader.js").Files} files @param {string} name @returns {Promise<any>} */
+/** @param {Files} files @param {string} name @returns {Promise<any>} */
 async function json(files, name) {
   const load = files.get(name);
   if (!load) throw new SceneError();
@@ -81,7 +77,7 @@ function joined(parts) {
   }, parts[0].rendering);
 }
 
-/** @param {import("./byte_reader.js").Files} files @returns {Promise<Part>} */
+/** @param {Files} files @returns {Promise<Part>} */
 async function sogPart(files) {
   const meta = await json(files, META);
   const { version = 1, means, scales, quats, sh0, shN } = meta, table = version === 2 ? codebook : steps;
@@ -150,7 +146,7 @@ let context = null;
 /**
  * Decode a lossless WebP image.
  *
- * @param {import("./byte_reader.js").Files} files
+ * @param {Files} files
  * @param {string} name
  * @param {number} least minimum number of pixels
  * @param {number} most maximum number of pixels

@@ -135,12 +135,7 @@ export class SplatScene {
     if (left) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row + rows, left, 1, form, type, data.subarray(rows * width * parts));
   }
 
-  /**
-   * Add or replace a color set: three halves for each Gaussian, as in `colors.f16`.
-   *
-   * @param {string} name
-   * @param {ReadableStream<Uint8Array>} stream
-   */
+  /** Add or replace a color set: three halves each. @param {string} name @param {ReadableStream<Uint8Array>} stream */
   async addColors(name, stream) {
     await this.headerRead;
     const { gl } = this, count = this.header?.count ?? 0, bytes = await new Response(stream).arrayBuffer();

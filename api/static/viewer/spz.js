@@ -26,12 +26,7 @@ const SPZ_4 = 4;
  * @property {boolean} rotated whether the axes are RUB
  */
 
-/**
- * Return a scene of SPZ version 1 to 3, which is one stream.
- *
- * @param {ByteReader} reader reader of the stream, which files compress
- * @returns {Promise<SceneFile>}
- */
+/** Return a scene of version 1 to 3, one stream. @param {ByteReader} reader @returns {Promise<SceneFile>} */
 export async function spz(reader) {
   const head = new DataView((await reader.take(16)).buffer);
   return spzScene(head, async (sizes) => {
@@ -110,11 +105,7 @@ function spzScene(head, load, newest) {
   }, antialiased ? ANTIALIASED : CLASSIC);
 }
 
-/**
- * Return whether extension records state that the axes are RUB, or none. A record has a type, a length in bytes, and content.
- *
- * @param {Uint8Array} records
- */
+/** Return whether records (type, length, content) state RUB axes, or none. @param {Uint8Array} records */
 function statesRub(records) {
   const view = new DataView(records.buffer, records.byteOffset, records.length);
   for (let o = 0; o + 12 <= records.length; o += 8 + view.getUint32(o + 4, true)) {

@@ -49,12 +49,7 @@ export const EXPRESSIONS = BASIS.map((polynomial) => Object.entries(polynomial).
 /** Return the values of all polynomials at a unit vector. @param {Vector} d */
 const valuesAt = (d) => BASIS.map((polynomial) => Object.entries(polynomial).reduce((sum, [product, factor]) => sum + [...product].reduce((value, axis) => value * d["xyz".indexOf(axis)], factor), 0));
 
-/**
- * Return how each coefficient of a rotated function follows from those before: indices and factors of the nonzero ones.
- *
- * @param {Vector[]} rows rows of the rotation's matrix
- * @returns {[number, number][][]}
- */
+/** Return how rotated coefficients follow: indices and factors of those before. @param {Vector[]} rows rotation */
 export function rotatedHarmonics(rows) {
   const matrix = BASIS.map(() => BASIS.map(() => 0)), columns = [0, 1, 2].map((axis) => rows.map((row) => row[axis]));
   for (const [z, weight] of NODES) {

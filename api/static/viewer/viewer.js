@@ -75,12 +75,7 @@ export class Viewer {
     this.draw();
   }
 
-  /**
-   * Look at the whole scene.
-   *
-   * @param {number[]} up
-   * @param {number[]} [front] direction from which to look, as far as it is level; by default that of the format
-   */
+  /** Look at the whole scene. @param {number[]} up @param {number[]} [front] by default that of the format */
   frame(up, front) {
     const scene = this.sides?.left.scene;
     if (scene?.middle) this.camera.frame(scene.middle, up, front ?? scene.front);
@@ -200,13 +195,7 @@ export class Viewer {
     return new Promise((done, wrong) => this.canvas.toBlob((blob) => (blob ? done(blob) : wrong(new Error(words.viewer.noPicture))), "image/png"));
   }
 
-  /**
-   * Return the center of the Gaussian that is visible at or near a point of the canvas; null if there is none.
-   *
-   * @param {number} x CSS pixels
-   * @param {number} y
-   * @returns {Promise<number[] | null>}
-   */
+  /** Return the center of what is seen near a point, or null. @param {number} x CSS pixels @param {number} y */
   async pointAt(x, y) {
     const view = pickedView(this), { clientWidth, clientHeight } = this.canvas;
     const index = view ? gaussianAt(view, (x * view.width) / clientWidth, (y * view.height) / clientHeight) : -1;
