@@ -81,11 +81,7 @@ function colmapCameras(images, intrinsics) {
   return byFace(found.sort((a, b) => (a.name < b.name ? -1 : 1)).map(({ cameras }) => cameras));
 }
 
-/**
- * Return the cube faces of a panorama, named and sized as the service does.
- *
- * @param {{name: string, position: Vector, axes: Vector[], width: number, height: number}} panorama
- */
+/** Return cube faces, as the service names and sizes them. @param {Omit<JobCamera, "fx" | "fy">} panorama */
 function cubeFaces({ name, position, axes, width }) {
   const side = Math.ceil(width / Math.PI), size = { fx: side / 2, fy: side / 2, width: side, height: side };
   return Object.entries(FACES).map(([face, signed]) =>

@@ -38,17 +38,14 @@ export class LossChart {
   /** @param {Point[]} points */
   add(points) {
     for (const { ...point } of points) {
-      if (point.stage === "measuring") point.stage = this.stageAt(point.step);
+      if (point.stage === "measuring") {
+        const before = [...this.points.values()].filter(({ step }) => step <= point.step).sort((a, b) => b.step - a.step);
+        point.stage = before[0]?.stage ?? "sos";
+      }
       if ((point.stage !== "coarse" && point.stage !== "sos") || !((point.seconds ?? 0) > 0) || !((point.loss ?? 0) > 0)) continue;
       this.points.set(`${point.stage}/${point.step}`, { ...this.points.get(`${point.stage}/${point.step}`), ...point });
     }
     this.later();
-  }
-
-  /** Return the stage of the latest point up to a step. @param {number} step */
-  stageAt(step) {
-    const before = [...this.points.values()].filter((point) => point.step <= step);
-    return before.sort((a, b) => b.step - a.step)[0]?.stage ?? "sos";
   }
 
   later() {

@@ -9,13 +9,7 @@ export const button = (name, onclick, kind = "quiet") => h(`button.${kind}.small
 /** @param {Parameters<typeof icon>[0]} picture @param {string} name @param {() => void} onclick @param {Record<string, any>} [more] */
 export const tool = (picture, name, onclick, more) => h("button.tool", { type: "button", title: name, "aria-label": name, onclick, ...more }, icon(picture));
 
-/**
- * Create buttons of which one is pressed, the first one at the start.
- *
- * @param {string} legend
- * @param {Record<string, string>} names titles by value
- * @param {(value: any) => void} changed
- */
+/** @param {string} legend @param {Record<string, string>} names by value @param {(value: any) => void} changed */
 export function radios(legend, names, changed) {
   const group = newId();
   return h("fieldset.segments", h("legend.away", legend), Object.entries(names).map(([value, name], i) => h("label", h("input", { type: "radio", name: group, value, checked: i === 0, onchange: () => changed(value) }), h("span", name))));

@@ -15,11 +15,7 @@ const say = words.job;
 const GONE = new Set(["succeeded", "expired"]);
 
 export class JobStage {
-  /**
-   * @param {string} id id of the job
-   * @param {AbortSignal} leaving aborted when the view ends
-   * @param {Stage} [before] stage of the view before, which has shown the scene of the job
-   */
+  /** @param {string} id @param {AbortSignal} leaving @param {Stage} [before] stage that has shown the job's scene */
   constructor(id, leaving, before) {
     this.id = id;
     this.leaving = leaving;

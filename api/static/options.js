@@ -54,13 +54,7 @@ export function optionControl(name, schema, { title = titleOf(name), hint = true
   };
 }
 
-/**
- * Return why a value does not fit its type, in words for users; "" if it does. The service checks the rest.
- *
- * @param {any[]} kinds
- * @param {any} value
- * @returns {string}
- */
+/** Return why a value does not fit its type, or "". @param {any[]} kinds @param {any} value @returns {string} */
 function problemOf(kinds, value) {
   if (value === undefined || typeof value === "boolean") return "";
   const array = kinds.find((kind) => kind.type === "array"), numeric = kinds.find(isNumber);

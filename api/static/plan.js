@@ -27,18 +27,15 @@ export function costCard(view, hurry = null) {
 /** @param {string[]} texts */
 const warnings = (texts) => (texts.length ? h("ul.warnings", { role: "alert" }, texts.map((text) => h("li", text))) : null);
 
-/** @param {{item: string, decision: string, reason: string}[]} list */
+/** @typedef {{item: string, decision: string, reason: string}} Decision */
+
+/** @param {Decision[]} list */
 function decisions(list) {
   if (!list.length) return h("p.quiet", say.none);
   return h("ul.decisions", { tabIndex: 0, "aria-label": say.decided }, list.map(({ item, decision, reason }) => h("li", h("strong", say.items[item] ?? item), h("span", decision), h("small", reason))));
 }
 
-/**
- * Return the plan of a job: its warnings, and everything else folded away.
- *
- * @param {HTMLElement} title
- * @param {{item: string, decision: string, reason: string}[]} list
- */
+/** Return a plan: its warnings, and the rest folded away. @param {HTMLElement} title @param {Decision[]} list */
 export function planOf(title, list) {
   const warned = list.filter(({ decision }) => decision.startsWith("warning")).map(({ item, decision }) => `${item}: ${decision.replace(/^warning:? ?/, "")}`);
   return [warnings(warned), h("details", h("summary", title), decisions(list))];

@@ -229,12 +229,7 @@ export class SubmitView {
     this.paintings.markInvalid();
   }
 
-  /**
-   * Plan the job, or start it, which ends a plan that is being made. An open selection is used.
-   *
-   * @param {boolean} dry whether to plan only
-   * @param {boolean} [sure] whether doubtful cameras are refused
-   */
+  /** Plan the job, or start it, and end its plan. @param {boolean} dry @param {boolean} [sure] no doubtful cameras */
   async act(dry, sure = true) {
     await this.selecting.settle();
     if (this.busy === "starting" || (dry && this.busy)) return;

@@ -27,13 +27,7 @@ function turnedUp(up, wanted) {
   return across.reduce((best, each) => (dot(each[1], wanted) > dot(best[1], wanted) ? each : best))[0];
 }
 
-/**
- * Create the buttons.
- *
- * @param {Stage} stage
- * @param {(up: string, front: Vector) => void} choose receives the value of the option `up`, and the direction from
- *   which to look then
- */
+/** @param {Stage} stage @param {(up: string, front: Vector) => void} choose receives `up` and where to look from */
 export function uprightButtons(stage, choose) {
   const turning = (/** @type {"turn" | "tip"} */ name, /** @type {(up: Vector, ahead: Vector) => [Vector, Vector]} */ turned) => tool(name, say[name], () => {
     if (!stage.viewer?.sides) return;
@@ -43,13 +37,7 @@ export function uprightButtons(stage, choose) {
   return h("div.upright", turning("turn", (up, ahead) => [cross(up, ahead), times(ahead, -1)]), turning("tip", (up, ahead) => [ahead, up]));
 }
 
-/**
- * Create the question.
- *
- * @param {Stage} stage
- * @param {string[]} candidates values of the option `up`, the likeliest first
- * @param {(up: string) => void} choose receives the value that the user has chosen
- */
+/** @param {Stage} stage @param {string[]} candidates likeliest `up` first @param {(up: string) => void} choose */
 export function upQuestion(stage, candidates, choose) {
   const others = Object.keys(UPS).filter((up) => !candidates.includes(up));
   const shown = !!stage.viewer?.sides?.left.scene.middle;

@@ -55,13 +55,7 @@ export class ViewCamera {
     return Object.assign(new ViewCamera(), this);
   }
 
-  /**
-   * Move to a pose between two, on an arc about the point between their targets.
-   *
-   * @param {ViewCamera} from
-   * @param {ViewCamera} to
-   * @param {number} share 0 for the first pose, 1 for the second
-   */
+  /** Move between two poses, on an arc. @param {ViewCamera} from @param {ViewCamera} to @param {number} share 0 to 1 */
   between(from, to, share) {
     const mixed = (/** @type {Vector} */ a, /** @type {Vector} */ b) => sum(times(a, 1 - share), times(b, share));
     // the rotation from one pose to the other by its axis, which half a turn leaves open

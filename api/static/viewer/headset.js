@@ -246,17 +246,12 @@ export class Placement {
     this.origin = sum(about, rotated(difference(this.origin, about), UP, angle));
   }
 
-  /**
-   * Follow one hand by a shift, two hands by a shift, a turn about the vertical and a change of size.
-   *
-   * @param {Vector[]} before positions of the hands
-   * @param {Vector[]} after
-   */
-  follow(before, after) {
+  /** Follow one hand by a shift, two also by a turn and a size. @param {Vector[]} before hands @param {Vector[]} now */
+  follow(before, now) {
     if (!before.length) return;
-    const middle = (/** @type {Vector[]} */ hands) => times(hands.reduce(sum), 1 / hands.length), from = middle(before), to = middle(after);
+    const middle = (/** @type {Vector[]} */ hands) => times(hands.reduce(sum), 1 / hands.length), from = middle(before), to = middle(now);
     if (before.length > 1) {
-      const [was, is] = [difference(before[1], before[0]), difference(after[1], after[0])];
+      const [was, is] = [difference(before[1], before[0]), difference(now[1], now[0])];
       const factor = Math.hypot(...is) / Math.max(Math.hypot(...was), 1e-3);
       this.size *= factor;
       this.origin = sum(from, times(difference(this.origin, from), factor));

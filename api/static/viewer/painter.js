@@ -44,12 +44,7 @@ export class Painter {
     this.pictureSize = [0, 0];
   }
 
-  /**
-   * Use a program, which is made at its first use. Return how to find its uniforms.
-   *
-   * @param {string} name
-   * @param {() => [string, string]} shaders returns the sources of its vertex and its fragment shader
-   */
+  /** Use a program; return how to find uniforms. @param {string} name @param {() => [string, string]} shaders texts */
   use(name, shaders) {
     const { program, at } = this.programs.get(name) ?? this.program(...shaders());
     this.programs.set(name, { program, at });

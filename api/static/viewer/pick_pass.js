@@ -51,12 +51,7 @@ export function gaussianAt({ ids, width, height }, x, y) {
   return found;
 }
 
-/**
- * Draw the scene on the left side as the viewer's camera sees it.
- *
- * @param {import("./viewer.js").Viewer} viewer
- * @returns {import("./selector.js").PickedView | null} null if there is none
- */
+/** Draw the left side as the camera sees it; null without a scene. @param {import("./viewer.js").Viewer} viewer */
 export function pickedView(viewer) {
   const { gl, camera, painter } = viewer, scene = viewer.sides?.left.scene;
   if (!scene?.drawn || !scene.geometry) return null;

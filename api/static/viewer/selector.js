@@ -219,11 +219,7 @@ export class Selector {
     return this.changing(mode, (i) => (centers[3 * i] - center[0]) ** 2 + (centers[3 * i + 1] - center[1]) ** 2 + (centers[3 * i + 2] - center[2]) ** 2 <= radius * radius);
   }
 
-  /**
-   * Return the Gaussians with a color similar to that of the one at a pixel.
-   *
-   * @param {{point: number[], tolerance: number, connected: boolean, mode: Mode}} request `tolerance`: 0 to 1
-   */
+  /** @param {{point: number[], tolerance: number, connected: boolean, mode: Mode}} request `tolerance`: 0 to 1 */
   similar({ point, tolerance, connected, mode }) {
     const seed = gaussianAt(this, point[0], point[1]), { colors } = this;
     if (seed < 0) return [];

@@ -37,13 +37,7 @@ export async function spz(reader) {
   }, SPZ_4 - 1);
 }
 
-/**
- * Return a scene of SPZ version 4: header, extension records, sizes of the streams, and a zstd stream for each section
- * that is not empty.
- *
- * @param {ByteReader} reader
- * @returns {Promise<SceneFile>}
- */
+/** Return a scene of version 4: header, records, sizes, and a zstd stream of each part. @param {ByteReader} reader */
 export async function spz4(reader) {
   const head = new DataView((await reader.take(32)).buffer), table = head.getUint32(16, true);
   return spzScene(head, async (sizes) => {
