@@ -24,10 +24,8 @@ export class Unreachable extends Error {
   }
 }
 
-/** Callback for answers that require a key. @type {() => void} */
-let onSignIn = () => {};
-/** @param {() => void} act */
-export const whenKeyIsNeeded = (act) => void (onSignIn = act);
+/** Event of the window after an answer that requires a key. */
+export const KEY_NEEDED = "sgsst-key-needed";
 
 /**
  * Send a request, and return its answer if it is not an error.
@@ -50,7 +48,7 @@ export async function ask(method, path, { body, json, headers = {}, signal } = {
   }
   if (answer.ok) return answer;
   const told = await answer.json().catch(() => null);
-  if (answer.status === 401 && path !== "v1/session") onSignIn();
+  if (answer.status === 401 && path !== "v1/session") dispatchEvent(new Event(KEY_NEEDED));
   throw new Problem(answer.status, told);
 }
 

@@ -83,31 +83,18 @@ export class LossChart {
     const x = (/** @type {number} */ value) => LEFT + ((width - LEFT - RIGHT) * Math.log(value / x0)) / Math.log(x1 / x0);
     const y = (/** @type {number} */ value) => TOP + ((HEIGHT - TOP - BOTTOM) * Math.log(y1 / value)) / Math.log(y1 / y0);
     const main = lines[lines.length - 1].line;
+    let lastX = -99, lastY = 1e9;
+    const across = ticks(x0, x1).filter((value) => x(value) - lastX > 36 && ((lastX = x(value)), true));
+    const upward = ticks(y0, y1).filter((value) => lastY - y(value) > 18 && ((lastY = y(value)), true));
     put(this.picture, svg("svg", { width, height: HEIGHT, role: "img", "aria-label": words.chart.told(main[0][1], main[main.length - 1][1], main[main.length - 1][0]) },
-      this.axes(x0, x1, y0, y1, x, y, width),
+      upward.flatMap((value) => [svg("path.grid", { d: `M${LEFT} ${y(value).toFixed(1)}H${width - RIGHT}` }), svg("text", { x: LEFT - 8, y: y(value) + 4, "text-anchor": "end" }, short(value))]),
+      across.map((value) => svg("text", { x: x(value), y: HEIGHT - BOTTOM + 18, "text-anchor": "middle" }, short(value))),
+      svg("text.axis", { x: width - RIGHT, y: HEIGHT - 2, "text-anchor": "end" }, words.chart.seconds),
+      svg("text.axis", { x: 0, y: 11 }, words.chart.loss),
       lines.map(({ kind, line }) => (line.length > 1
         ? svg("path", { class: `line ${kind}`, d: line.map(([px, py], i) => `${i ? "L" : "M"}${x(px).toFixed(1)} ${y(py).toFixed(1)}`).join("") })
         : svg("circle", { class: `dot ${kind}`, cx: x(line[0][0]), cy: y(line[0][1]), r: 3 })))));
     put(this.legend, lines.map(({ name, kind }) => h("span", svg("svg.key", { viewBox: "0 0 18 4", "aria-hidden": "true" }, svg("path", { class: `line ${kind}`, d: "M0 2h18" })), name)));
-  }
-
-  /**
-   * @param {number} x0 @param {number} x1 @param {number} y0 @param {number} y1
-   * @param {(value: number) => number} x
-   * @param {(value: number) => number} y
-   * @param {number} width
-   */
-  axes(x0, x1, y0, y1, x, y, width) {
-    let lastX = -99;
-    const across = ticks(x0, x1).filter((value) => x(value) - lastX > 36 && ((lastX = x(value)), true));
-    let lastY = 1e9;
-    const upward = ticks(y0, y1).filter((value) => lastY - y(value) > 18 && ((lastY = y(value)), true));
-    return [
-      ...upward.flatMap((value) => [svg("path.grid", { d: `M${LEFT} ${y(value).toFixed(1)}H${width - RIGHT}` }), svg("text", { x: LEFT - 8, y: y(value) + 4, "text-anchor": "end" }, short(value))]),
-      ...across.map((value) => svg("text", { x: x(value), y: HEIGHT - BOTTOM + 18, "text-anchor": "middle" }, short(value))),
-      svg("text.axis", { x: width - RIGHT, y: HEIGHT - 2, "text-anchor": "end" }, words.chart.seconds),
-      svg("text.axis", { x: 0, y: 11 }, words.chart.loss),
-    ];
   }
 
   end() {

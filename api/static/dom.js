@@ -25,17 +25,11 @@ export function h(name, properties, ...children) {
   return made;
 }
 
-/**
- * Create an SVG element; all properties become attributes.
- *
- * @param {string} name
- * @param {Record<string, any>} [properties]
- * @param {...(Child | Child[])} children
- */
-export function svg(name, properties, ...children) {
+/** Create an SVG element. @param {string} name @param {any} [attributes] @param {...(Child | Child[])} children */
+export function svg(name, attributes, ...children) {
   const [tag, ...classes] = name.split("."), made = document.createElementNS(SVG, tag);
   if (classes.length) made.setAttribute("class", classes.join(" "));
-  fill(made, properties, children, (key, value) => made.setAttribute(key, value));
+  fill(made, attributes, children, (key, value) => made.setAttribute(key, value));
   return made;
 }
 

@@ -106,8 +106,7 @@ export class JobsView {
 
   /** @param {string} id @param {boolean} on */
   choose(id, on) {
-    if (on) this.chosen.add(id);
-    else this.chosen.delete(id);
+    this.chosen[on ? "add" : "delete"](id);
     this.compare.disabled = this.chosen.size < 2;
   }
 
@@ -177,15 +176,7 @@ function later(act, milliseconds, signal) {
   return setTimeout(() => (document.hidden ? document.addEventListener("visibilitychange", act, { once: true, signal }) : act()), milliseconds);
 }
 
-/**
- * Return the image of a job with its label and status.
- *
- * @param {any} job
- * @param {string} name
- * @param {Record<string, string>} how properties of the image
- * @param {HTMLElement | null} [facts] element below the name
- * @param {any[]} [tools] elements beside the status
- */
+/** @param {any} job @param {string} name @param {any} how of the image @param {any} [facts] @param {any[]} [tools] */
 function tile(job, name, how, facts = null, tools = []) {
   const painted = stepFraction(job);
   const image = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: "", decoding: "async", ...how }) : h("span.blank", { "aria-hidden": "true" });

@@ -1,10 +1,6 @@
 // @ts-check
-/**
- * The page: its frame, the view for each address, and the session.
- *
- * The page never stores an API key: the service answers with a cookie that scripts cannot read.
- */
-import { ask, get, Problem, whenKeyIsNeeded } from "./api.js";
+/** The page: its frame, its views by address, and the session, whose cookie scripts cannot read. No key is stored. */
+import { ask, get, KEY_NEEDED, Problem } from "./api.js";
 import { CompareView, JobsView } from "./jobs.js";
 import { announce, h, icon, messageOf, newId, put, tell } from "./dom.js";
 import { JobView } from "./job.js";
@@ -85,7 +81,7 @@ async function begin() {
   else enter();
 }
 
-whenKeyIsNeeded(() => signIn());
+addEventListener(KEY_NEEDED, () => signIn());
 addEventListener("hashchange", () => {
   if (view instanceof SignInView) return;
   enter();

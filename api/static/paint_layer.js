@@ -1,8 +1,5 @@
 // @ts-check
-/**
- * What is painted on a view: a transparent layer of strokes and images, which are undone one by one, and PNGs with a
- * text (chunks tEXt and iTXt of the PNG specification) that states the view.
- */
+/** What is painted on a view: a layer of strokes and images, and PNGs with a text (tEXt, iTXt) that states the view. */
 import { h } from "./dom.js";
 
 /** @typedef {{image?: ImageBitmap, color?: string, size?: number, points?: number[][]}} Mark image of the layer's size, or stroke, with its width and points in pixels of the layer */
@@ -22,14 +19,14 @@ export class PaintLayer {
     this.frame = frame;
     this.brush = brush;
     this.changed = changed;
-    this.canvas = h("canvas.surface.paint", { "aria-hidden": "true" });
     this.tip = h("span.tip", { hidden: true });
-    const listen = (/** @type {string} */ kind, /** @type {(event: PointerEvent) => void} */ act) => this.canvas.addEventListener(kind, act);
-    listen("pointerdown", (event) => this.down(event));
-    listen("pointermove", (event) => this.move(event));
-    for (const kind of ["pointerup", "pointercancel"]) listen(kind, (event) => this.up(event));
-    listen("pointerleave", () => (this.tip.hidden = true));
-    listen("contextmenu", (event) => event.preventDefault());
+    const up = (/** @type {PointerEvent} */ event) => event.pointerId === this.stroke?.id && (this.stroke = null);
+    this.canvas = h("canvas.surface.paint", {
+      "aria-hidden": "true", onpointerup: up, onpointercancel: up, onpointerleave: () => (this.tip.hidden = true),
+      onpointerdown: (/** @type {PointerEvent} */ event) => this.down(event),
+      onpointermove: (/** @type {PointerEvent} */ event) => this.move(event),
+      oncontextmenu: (/** @type {Event} */ event) => event.preventDefault(),
+    });
   }
 
   /** Start with an empty layer. @param {number} width pixels @param {number} height */
@@ -78,11 +75,6 @@ export class PaintLayer {
     const { points } = this.stroke, known = points.length, coalesced = event.getCoalescedEvents?.() ?? [];
     points.push(...(coalesced.length ? coalesced : [event]).map((each) => this.pixelOf(each)));
     this.draw(this.marks[this.marks.length - 1], known - 1);
-  }
-
-  /** @param {PointerEvent} event */
-  up(event) {
-    if (event.pointerId === this.stroke?.id) this.stroke = null;
   }
 
   /** @param {Mark} mark */

@@ -1,8 +1,5 @@
 // @ts-check
-/**
- * Results of one scene in 3D: the original and the colors of each run, two of them on the sides of the wipe. Of an
- * unfinished run, the colors so far.
- */
+/** Results of one scene in 3D: the original and each run's colors, or those so far, two on the sides of the wipe. */
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
 import { Blend } from "./blend.js";

@@ -38,7 +38,14 @@ export class SelectPanel {
     this.finish = null;
     /** Controls of the panel. @type {any} */
     this.parts = {};
-    this.surface = h("canvas.surface", { hidden: true, "aria-hidden": "true" });
+    this.surface = h("canvas.surface", {
+      hidden: true, "aria-hidden": "true", onpointerup: () => this.up(), onpointercancel: () => this.up(),
+      onpointerleave: () => !this.drawn.length && this.paint(),
+      onpointerdown: (/** @type {PointerEvent} */ event) => this.down(event),
+      onpointermove: (/** @type {PointerEvent} */ event) => this.move(event),
+      oncontextmenu: (/** @type {Event} */ event) => event.preventDefault(),
+      onwheel: (/** @type {WheelEvent} */ event) => stage.controls?.wheel(event),
+    });
     this.counted = h("output");
     stage.frame.append(this.surface);
     this.shapes = new ShapeTool(stage, (lines) => {
@@ -47,7 +54,7 @@ export class SelectPanel {
     });
     this.build();
     stage.element.append(this.element);
-    this.listen();
+    document.addEventListener("keydown", (event) => this.key(event), { signal: this.leaving.signal });
   }
 
   build() {
@@ -70,18 +77,6 @@ export class SelectPanel {
       h("div.row", this.parts.undo, this.parts.redo, button(say.invert, () => this.ask("invert")), button(say.clear, () => this.ask("clear")),
         h("span.grow"), button(say.cancel, () => this.close(null)), button(say.done, () => this.done(), "primary")));
     this.choose("move");
-  }
-
-  listen() {
-    const { surface, stage } = this;
-    surface.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => this.down(event));
-    surface.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => this.move(event));
-    surface.addEventListener("pointerup", () => this.up());
-    surface.addEventListener("pointercancel", () => this.up());
-    surface.addEventListener("pointerleave", () => !this.drawn.length && this.paint());
-    surface.addEventListener("contextmenu", (/** @type {Event} */ event) => event.preventDefault());
-    surface.addEventListener("wheel", (/** @type {WheelEvent} */ event) => (event.preventDefault(), stage.controls?.wheel(event)), { passive: false });
-    document.addEventListener("keydown", (event) => this.key(event), { signal: this.leaving.signal });
   }
 
   /**

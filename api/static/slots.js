@@ -21,13 +21,7 @@ function withoutDoubles(old, more) {
   return [...old.filter(({ name }) => !names.has(name)), ...more];
 }
 
-/**
- * Add camera files to others. A JSON file holds all cameras, so it replaces what was there; the files of a COLMAP model
- * belong together.
- *
- * @param {Chosen[]} old
- * @param {Chosen[]} more
- */
+/** Add camera files: JSON replaces all, parts of a COLMAP model join. @param {Chosen[]} old @param {Chosen[]} more */
 export function oneModel(old, more) {
   const isJson = (/** @type {Chosen} */ { name }) => /\.json$/i.test(name);
   return more.some(isJson) ? more : withoutDoubles(old.filter((file) => !isJson(file)), more);
@@ -37,16 +31,12 @@ export class Slot {
   /**
    * @param {string} name
    * @param {string} hint
-   * @param {{accept?: string, multiple?: boolean, pictures?: boolean, add?: (old: Chosen[], more: Chosen[]) => Chosen[], problem?: (file: File) => Promise<string>, changed: () => void}} how
+   * @param {{accept: string, multiple?: boolean, pictures?: boolean, add?: (old: Chosen[], more: Chosen[]) => Chosen[], problem?: (file: File) => Promise<string>, changed: () => void}} how
    *   `add` returns the files after some were chosen, `problem` why a file cannot be used
    */
-  constructor(name, hint, { accept = "", multiple = false, pictures = false, add = withoutDoubles, problem = async () => "", changed }) {
+  constructor(name, hint, how) {
     this.hint = hint;
-    this.multiple = multiple;
-    this.pictures = pictures;
-    this.problem = problem;
-    this.changed = changed;
-    this.combined = add;
+    this.how = how;
     /** Why the files cannot be used, as far as the page knows; "" if they can. */
     this.broken = "";
     /** Names of files to choose again, and the text that asks for them. @type {string[]} */
@@ -59,6 +49,7 @@ export class Slot {
     /** Notes under files, by name. @type {Record<string, string>} */
     this.notes = {};
     const id = newId();
+    const { accept, multiple } = how;
     this.input = h("input", { type: "file", id, accept, multiple, "aria-describedby": `${id}d ${id}e`, onchange: () => this.add([...this.input.files]) });
     this.detail = h("p.detail", { id: `${id}d` }, hint);
     this.error = h("p.wrong", { id: `${id}e`, hidden: true });
@@ -72,8 +63,9 @@ export class Slot {
   add(files) {
     if (!files.length) return;
     const unread = installed.heif ? [] : files.filter(({ name }) => HEIC.test(name)), read = files.filter((file) => !unread.includes(file));
-    if (read.length) this.files = this.multiple ? this.combined(this.files, read) : [read[0]];
-    this.missing = this.multiple ? this.missing.filter((name) => !files.some((file) => file.name === name)) : [];
+    const { multiple, add = withoutDoubles } = this.how;
+    if (read.length) this.files = multiple ? add(this.files, read) : [read[0]];
+    this.missing = multiple ? this.missing.filter((name) => !files.some((file) => file.name === name)) : [];
     this.input.value = "";
     this.update();
     if (unread.length) this.wrong(say.noHeic(unread[0].name));
@@ -89,14 +81,14 @@ export class Slot {
   update() {
     this.broken = "";
     this.show();
-    this.changed();
+    this.how.changed();
     this.check();
   }
 
   async check() {
     const { files } = this;
     for (const file of files) {
-      const wrong = file.size ? file instanceof File && (await this.problem(file)) : words.contents.empty(file.name);
+      const wrong = file.size ? file instanceof File && (await this.how.problem?.(file)) : words.contents.empty(file.name);
       if (files !== this.files) return;
       if (wrong) return this.fail(wrong);
     }
@@ -114,7 +106,7 @@ export class Slot {
     this.urls = [];
     const { files } = this;
     this.element.classList.toggle("filled", files.length > 0);
-    this.action.textContent = files.length && !this.multiple ? say.change : say.choose;
+    this.action.textContent = files.length && !this.how.multiple ? say.change : say.choose;
     const total = files.reduce((sum, file) => sum + file.size, 0);
     const told = files.length > 1 ? `${say.nFiles(files.length)} · ${size(total)}` : files.length ? size(total) : this.missing.length ? "" : this.hint;
     this.say([told, this.missing.length && this.ask(this.missing)].filter(Boolean).join(" · "));
@@ -161,7 +153,7 @@ export class Slot {
   /** @param {Chosen} file */
   thumb(file) {
     const remove = tool("close", say.remove(file.name), () => this.remove(file));
-    if (!this.pictures) return h("div.thumb.plain", h("span", file.name), remove);
+    if (!this.how.pictures) return h("div.thumb.plain", h("span", file.name), remove);
     const edit = tool("crop", words.painting.edit(file.name), () => this.edit(file));
     edit.classList.add("edit");
     const url = file instanceof StoredFile ? file.url : URL.createObjectURL(file);

@@ -23,7 +23,14 @@ export class Stage {
     this.overlay = h("div.overlay");
     this.note = h("p.note", { hidden: true });
     this.bar = h("div.loading", { hidden: true }, h("span"));
-    this.divider = h("div.divider", { hidden: true, "aria-hidden": "true" }, h("span"));
+    this.divider = h("div.divider", {
+      hidden: true, "aria-hidden": "true", onwheel: (/** @type {WheelEvent} */ event) => this.controls?.wheel(event),
+      onpointerdown: (/** @type {PointerEvent} */ event) => this.divider.setPointerCapture(event.pointerId),
+      onpointermove: (/** @type {PointerEvent} */ event) => {
+        const { left, width } = this.canvas.getBoundingClientRect();
+        if (event.buttons) this.setWipe(Math.max(0, Math.min(1, (event.clientX - left) / width)));
+      },
+    }, h("span"));
     this.leftName = h("span.side.left", { hidden: true });
     this.rightName = h("span.side.right", { hidden: true });
     this.tools = h("div.tools", { role: "toolbar", "aria-label": say.name });
@@ -66,12 +73,6 @@ export class Stage {
       before.viewer = null;
       this.drawFrames();
     }
-    this.divider.addEventListener("wheel", (/** @type {WheelEvent} */ event) => this.controls?.wheel(event), { passive: false });
-    this.divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => {
-      const { left, width } = this.canvas.getBoundingClientRect();
-      if (event.buttons) this.setWipe(Math.max(0, Math.min(1, (event.clientX - left) / width)));
-    });
-    this.divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => this.divider.setPointerCapture(event.pointerId));
   }
 
   makeTools() {
@@ -82,7 +83,11 @@ export class Stage {
       if (this.controls) this.controls.motion.orbit = mode === "orbit"; // otherwise about the eye
       this.setHelp();
     });
-    this.framesButton = tool("cameras", say.frames, () => this.toggleFrames(), { hidden: true, "aria-pressed": "true" });
+    this.framesButton = tool("cameras", say.frames, () => {
+      this.framesShown = !this.framesShown;
+      this.framesButton.setAttribute("aria-pressed", String(this.framesShown));
+      this.drawFrames();
+    }, { hidden: true, "aria-pressed": "true" });
     this.chooser = h("select", { "aria-label": say.camera, onchange: () => this.stand(Number(this.chooser.value)) });
     this.cameraTools = h("div.cameras", { hidden: true },
       tool("left", say.previous, () => this.stand(this.stood - 1)), this.chooser, tool("right", say.next, () => this.stand(this.stood + 1)));
@@ -91,7 +96,7 @@ export class Stage {
     this.setHelp();
     help.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && help.open && (event.stopPropagation(), (help.open = false)));
     put(this.tools, this.wipe, this.cameraTools, modes,
-      h("div.buttons", this.framesButton, tool("home", say.home, () => this.home()), tool("picture", say.screenshot, () => this.save()), tool("full", say.full, () => this.full()), help));
+      h("div.buttons", this.framesButton, tool("home", say.home, () => this.home()), tool("picture", say.screenshot, () => this.save()), tool("full", say.full, () => (document.fullscreenElement ? document.exitFullscreen() : this.element.requestFullscreen?.())), help));
     this.offerHeadsets();
   }
 
@@ -194,12 +199,6 @@ export class Stage {
     this.drawFrames();
   }
 
-  toggleFrames() {
-    this.framesShown = !this.framesShown;
-    this.framesButton.setAttribute("aria-pressed", String(this.framesShown));
-    this.drawFrames();
-  }
-
   drawFrames() {
     const { viewer } = this;
     if (!viewer) return;
@@ -286,11 +285,6 @@ export class Stage {
   /** Name of the camera that the view is that of, without folder and suffix. */
   get viewName() {
     return this.cameras[this.stood]?.name.replace(/^.*\/|\.[^.]*$/g, "") || say.view;
-  }
-
-  full() {
-    if (document.fullscreenElement) document.exitFullscreen();
-    else this.element.requestFullscreen?.();
   }
 
   end() {

@@ -36,15 +36,10 @@ export class Submission {
     this.stopping = new AbortController();
   }
 
-  /** Stop planning, or don't start it. */
-  stopPlanning() {
-    this.stopping.abort();
-  }
-
   /** Stop sending and planning; the form stays as it is. */
   stop() {
     this.stopped = true;
-    this.stopPlanning();
+    this.stopping.abort();
     for (const upload of this.sending) upload.stop();
   }
 
@@ -60,7 +55,7 @@ export class Submission {
     return Object.fromEntries(Object.entries(files).map(([role, chosen]) => [role, named(chosen)]));
   }
 
-  /** Return a plan; undefined if `stopPlanning` was called. @param {any} body @returns {Promise<any>} */
+  /** Return a plan; undefined if `stopping` was aborted. @param {any} body @returns {Promise<any>} */
   async plan(body) {
     this.tell(say.planning);
     const signal = AbortSignal.any([this.leaving, this.stopping.signal]), headers = { Accept: "text/event-stream" };

@@ -112,7 +112,10 @@ export class SubmitView {
     const { draft, options } = this;
     if (draft) {
       options.restore(draft.values, draft.preset);
-      if (draft.orbiting) this.views.restore();
+      if (draft.orbiting) {
+        this.views.around.input.checked = true;
+        this.views.chosen = this.slots.cameras.files.length > 0;
+      }
     } else options.useBudget();
     this.views.show();
     this.form.addEventListener("input", () => this.saveDraft());
@@ -239,7 +242,7 @@ export class SubmitView {
     if (this.refusals.reveal()) return;
     const planning = !!this.busy;
     this.setBusy(dry ? "planning" : "starting");
-    if (planning) this.submission.stopPlanning();
+    if (planning) this.submission.stopping.abort();
     else await this.request(dry);
   }
 

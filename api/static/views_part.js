@@ -121,25 +121,18 @@ export class ViewsPart {
     const up = UPS[controls.get("up")?.value()] ?? this.stage.up;
     return [ringCameras(middle, { count: shown, up, elevation: controls.get("elevation")?.value() ?? 10, radius: controls.get("radius")?.value() }), told];
   }
-
-  restore() {
-    this.around.input.checked = true;
-    this.chosen = this.slots.cameras.files.length > 0;
-  }
 }
 
 export class ScenePart {
   /**
    * @param {Slot} slot
    * @param {Stage} stage
-   * @param {{loaded: () => void, reload: () => void}} how `loaded` is called once the scene is shown, `reload` if the
-   *   graphics card has lost it
+   * @param {{loaded: () => void, reload: () => void}} how called once the scene is shown, and if the GPU has lost it
    */
-  constructor(slot, stage, { loaded, reload }) {
+  constructor(slot, stage, how) {
     this.slot = slot;
     this.stage = stage;
-    this.loaded = loaded;
-    this.reload = reload;
+    this.how = how;
     /** @type {import("./viewer/splat_scene.js").SplatScene | null} */
     this.opened = null;
   }
@@ -157,13 +150,13 @@ export class ScenePart {
       return viewer.draw();
     }
     const scene = (this.opened = viewer.open(file instanceof StoredFile ? file.url : file));
-    viewer.onReload = () => this.reload();
+    viewer.onReload = this.how.reload;
     this.stage.show({ scene, colors: "own" });
     try {
       const header = await scene.headerRead;
       this.slot.say(words.scene.header(header));
       await scene.ready;
-      this.loaded();
+      this.how.loaded();
     } catch (error) {
       if (this.opened !== scene) return;
       this.stage.bar.hidden = true;

@@ -1,9 +1,5 @@
 // @ts-check
-/**
- * Stereo view of a scene in a headset (WebXR): each eye is drawn with one depth order, and hands and sticks move it.
- *
- * The scene stays where it is; the poses of the eyes in the room are brought into its coordinates by a `Placement`.
- */
+/** Stereo view in a headset (WebXR): one depth order for both eyes. Hands and sticks move the room around the scene. */
 import { words } from "../words.js";
 import { cross, difference, dot, rotated, sum, times, unit } from "./vectors.js";
 
@@ -141,8 +137,11 @@ export class Headset {
       if (!gamepad) continue;
       const pressed = (/** @type {number} */ button) => gamepad.buttons[button]?.pressed === true;
       const [x, y] = gamepad.axes.slice(-2).map((/** @type {number} */ value) => (Math.abs(value) < REST ? 0 : value));
-      if (handedness === "left") this.walk(pose, x, y, seconds);
-      else {
+      if (handedness === "left") {
+        const m = pose.transform.matrix, flat = Math.hypot(m[8], m[10]) || 1;
+        const back = [m[8] / flat, 0, m[10] / flat], right = [back[2], 0, -back[0]];
+        this.placement.shift(times(sum(times(right, x), times(back, y)), -WALK * seconds));
+      } else {
         this.placement.turn(x * TURN * seconds, head);
         this.share = Math.max(0, Math.min(1, this.share - y * BLEND * seconds));
       }
@@ -158,12 +157,6 @@ export class Headset {
     const both = [...grips.keys()].filter((hand) => this.grips.has(hand));
     this.placement.follow(both.map((hand) => /** @type {Vector} */ (this.grips.get(hand))), both.map((hand) => grips.get(hand)));
     this.grips = grips;
-  }
-
-  /** @param {any} pose @param {number} x to the right @param {number} y backward @param {number} seconds */
-  walk(pose, x, y, seconds) {
-    const m = pose.transform.matrix, flat = Math.hypot(m[8], m[10]) || 1, back = [m[8] / flat, 0, m[10] / flat], right = [back[2], 0, -back[0]];
-    this.placement.shift(times(sum(times(right, x), times(back, y)), -WALK * seconds));
   }
 
   /** Return the rays, with rings where they reach the floor, as pairs of points in the scene. */

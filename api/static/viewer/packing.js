@@ -68,10 +68,7 @@ export const SH_C0 = 0.28209479177387814;
 /** Values of a row that every scene has. */
 export const NAMES = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
 export const OPACITY = 3, SCALES = 4, ROTATION = 7, COLOR = 11, HARMONICS = NAMES.length;
-/**
- * Logits of opacities in steps of 1/255. Opacities of exactly 0 and 1 have no finite logit; they are read as 0.25/255
- * and 1 - 0.25/255.
- */
+/** Logits of opacities in steps of 1/255; 0 and 1, which have none, are read as 0.25/255 and 1 - 0.25/255. */
 export const LOGITS = Float32Array.from({ length: 256 }, (_, i) => {
   const share = Math.min(Math.max(i / 255, 0.25 / 255), 1 - 0.25 / 255);
   return Math.log(share / (1 - share));

@@ -14,32 +14,21 @@ const HIGHLIGHT = 0.6;
 const INK = [0.98, 0.6, 0.28, 0.55];
 
 export class Painter {
-  /** @type {Map<string, Program>} */
-  programs = new Map();
-  /** Framebuffer for blending. @type {WebGLFramebuffer | null} */
-  frame = null;
-  /** @type {WebGLTexture | null} */
-  picture = null;
-  pictureSize = [0, 0];
-
   /** @param {import("./viewer.js").Viewer} viewer */
   constructor(viewer) {
+    const gl = (this.gl = viewer.gl);
     this.viewer = viewer;
-    this.gl = viewer.gl;
-    this.prepare();
-  }
-
-  /** Create everything that the GPU context holds; again after it was lost. */
-  prepare() {
-    const { gl } = this;
     this.exact = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     gl.getExtension("OES_texture_float_linear");
+    /** @type {Map<string, Program>} */
     this.programs = new Map();
     this.corners = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.corners);
     gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
     this.lineBuffer = gl.createBuffer();
+    /** Framebuffer for blending. */
     this.frame = gl.createFramebuffer();
+    /** @type {WebGLTexture | null} */
     this.picture = null;
     this.pictureSize = [0, 0];
   }
@@ -159,13 +148,7 @@ export class Painter {
     gl.disable(gl.BLEND);
   }
 
-  /**
-   * @param {Side} left
-   * @param {Side} right colors of the same scene
-   * @param {number} cut position of the wipe in pixels
-   * @param {number} width
-   * @param {number} height
-   */
+  /** @param {Side} left @param {Side} right @param {number} cut pixels @param {number} width @param {number} height */
   drawScene(left, right, cut, width, height) {
     const { gl } = this, { scene } = left;
     const own = scene.colors.get("own");
@@ -193,7 +176,7 @@ export class Painter {
   /** Draw each Gaussian of a scene's order as two triangles, with the current program. @param {SplatScene} scene */
   drawInstances(scene) {
     const { gl } = this;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.corners ?? null);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.corners);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
     gl.bindBuffer(gl.ARRAY_BUFFER, scene.order);
@@ -242,7 +225,7 @@ export class Painter {
     const { gl } = this, at = this.use("lines", () => [lineVertex, lineFragment]);
     this.setView(at, width, height);
     gl.uniform1f(at("near"), 1e-3 * this.viewer.camera.size);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.lineBuffer ?? null);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.lineBuffer);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
     gl.bufferData(gl.ARRAY_BUFFER, lines, gl.STREAM_DRAW);

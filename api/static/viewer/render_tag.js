@@ -40,13 +40,7 @@ export function extrasRendering(extras) {
 /** Return whether properties are those of 2DGS, whose Gaussians have no third axis. @param {string[]} names */
 export const isFlat = (names) => names.includes("scale_1") && !names.includes("scale_2") && !names.includes("scale");
 
-/**
- * Return the render mode of a job, whose parameters may replace what the file states.
- *
- * @param {Rendering} stated
- * @param {{render_mode?: string, eps2d?: number | null}} parameters
- * @returns {Rendering}
- */
+/** Return a job's render mode, which may replace the file's. @param {Rendering} stated @param {any} parameters */
 export function requestedRendering(stated, { render_mode = "auto", eps2d }) {
   const antialiased = render_mode === "auto" ? stated.antialiased : render_mode === "antialiased";
   const own = antialiased === stated.antialiased ? stated.eps2d : EPS2D;

@@ -241,13 +241,7 @@ function joined(first, second) {
   return both;
 }
 
-/**
- * Return which pixels have their center inside a polygon, by the even-odd rule.
- *
- * @param {number[]} points x and y of each corner
- * @param {number} width
- * @param {number} height
- */
+/** Fill a polygon (even-odd). @param {number[]} points x, y, x, ... @param {number} width @param {number} height */
 export function filled(points, width, height) {
   const found = new Uint8Array(width * height), corners = points.length / 2;
   for (let row = 0; row < height; row++) {

@@ -11,10 +11,7 @@ import { words } from "../words.js";
 
 /** Type of the extension record that states the axes, and maximum bytes of records. */
 const AXES_EXTENSION = 0xadbe0003, MAX_EXTENSIONS = 1 << 20;
-/**
- * Signs of the harmonics' coefficients of degree 1 to 3 under a half rotation about x, from axes with y up and z
- * backward (RUB) to those of a PLY.
- */
+/** Signs of harmonics of degree 1 to 3 under a half rotation about x, from RUB axes (y up, z backward) to a PLY's. */
 const ROTATED = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
 
 /** Version of files whose attributes are zstd streams of their own. */

@@ -22,6 +22,8 @@ export class Viewer {
 
   told = () => {};
 
+  onReload = () => {};
+
   /** @param {HTMLCanvasElement} canvas */
   constructor(canvas) {
     this.canvas = canvas;
@@ -54,7 +56,12 @@ export class Viewer {
     /** @type {WebGLSync | null} */
     this.fence = null;
     this.leaving = new AbortController();
-    canvas.addEventListener("webglcontextlost", (event) => this.lose(event), { signal: this.leaving.signal });
+    canvas.addEventListener("webglcontextlost", (event) => {
+      event.preventDefault();
+      this.lost = true;
+      canvas.dataset.state = "lost";
+      this.told();
+    }, { signal: this.leaving.signal });
     canvas.addEventListener("webglcontextrestored", () => this.restore(), { signal: this.leaving.signal });
     this.resized = new ResizeObserver(() => this.draw());
     this.resized.observe(canvas);
@@ -202,28 +209,17 @@ export class Viewer {
     return index < 0 ? null : /** @type {Side} */ (this.sides?.left).scene.centerOf(index);
   }
 
-  /** @param {Event} event */
-  lose(event) {
-    event.preventDefault();
-    this.lost = true;
-    this.canvas.dataset.state = "lost";
-    this.told();
-  }
-
   /** Reload everything after a lost GPU context is restored. */
   restore() {
     this.lost = false;
-    this.painter.prepare();
+    this.painter = new Painter(this);
     this.fence = null;
     this.framed = null;
     const before = this.sides;
     this.sides = null;
-    if (before) this.onReload?.(before);
+    if (before) this.onReload();
     this.told();
   }
-
-  /** @type {((sides: {left: Side, right: Side}) => void) | undefined} */
-  onReload;
 
   end() {
     this.ended = true;
