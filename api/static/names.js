@@ -29,7 +29,7 @@ export const nameOf = (job) => job.name || words.job.unnamed;
 /** Return what a view of a job calls its result. @param {any} job */
 export const resultName = ({ parameters }) => (parameters?.painted?.length ? words.viewer.painted : words.viewer.stylized);
 
-/** Return unlike labels: styles, and where alike names, times and numbers. @param {any[]} jobs @returns {string[]} */
+/** Return distinct labels: styles; if equal, names, times and numbers too. @param {any[]} jobs @returns {string[]} */
 export function labels(jobs) {
   let found = jobs.map(stylesOf);
   for (const way of [nameOf, (/** @type {any} */ job) => time(job.created_at)]) {

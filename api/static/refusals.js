@@ -65,8 +65,7 @@ export class Refusals {
   reveal() {
     const input = this.element.closest("form")?.querySelector("[aria-invalid=true]"), place = input?.closest(".region") ?? input?.closest(".option, .slot, .shares");
     if (!(input instanceof HTMLElement) || !(place instanceof HTMLElement)) return false;
-    for (let fold = input.closest("details"); fold; fold = fold.parentElement?.closest("details") ?? null) fold.hidden = !(fold.open = true);
-    place.hidden = false;
+    for (let fold = input.closest("details"); fold; fold = fold.parentElement?.closest("details") ?? null) fold.open = true;
     place.scrollIntoView({ block: "center" });
     input.focus({ preventScroll: true });
     announce(place.querySelector(".wrong:not([hidden])")?.textContent ?? "");

@@ -232,7 +232,7 @@ export class SubmitView {
     this.paintings.markInvalid();
   }
 
-  /** Plan the job, or start it, and end its plan. @param {boolean} dry @param {boolean} [sure] no doubtful cameras */
+  /** Plan a job, or start it and end its plan. @param {boolean} dry @param {boolean} [sure] refuse doubtful cameras */
   async act(dry, sure = true) {
     await this.selecting.settle();
     if (this.busy === "starting" || (dry && this.busy)) return;

@@ -13,7 +13,7 @@ export const UNFINISHED = new Set(states.unfinished), WORKING = new Set(states.w
 /** Return the actions that a status allows, `POST /v1/jobs/{id}/{name}`, with their titles. @param {string} status */
 export const actionsOf = (status) => states.actions.filter((action) => action.statuses.includes(status));
 
-/** `result`: of downloads too. @type {{ name: string, suffix: string, title: string, result: boolean }[]} */
+/** `result`: whether results have it. @type {{ name: string, suffix: string, title: string, result: boolean }[]} */
 export const sceneFormats = /** @type {any} */ ("{{scene_formats}}");
 
 /** Formats of a downloaded result, PLY first. @type {{ name: string, title: string }[]} */
