@@ -1,7 +1,7 @@
 """Warnings about extreme values in a scene, its views and its style, shown before a long job.
 
-Each finding has a count, the worst case and its consequence. Findings are not errors: the file readers reject unusable
-input.
+Each finding has a count, the worst case and its consequence. What has no consequence, such as needles and long
+quaternions, is not reported. Findings are not errors: the file readers reject unusable input.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, FRUSTUM_MARGIN
+from sgsst_core.constants import ALPHA_MIN, FRUSTUM_MARGIN
 from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.scene_file import SceneFile
@@ -30,14 +30,8 @@ from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.style import Style
 
-#: Plausible range of lengths of trained quaternions. Lengths outside it indicate a failed training or export.
-QUATERNION_LENGTHS = (1e-3, 1e3)
-#: Thresholds of Gaussian size relative to the scene's extent. Above the first, a Gaussian is larger than the scene;
-#: below the second, no view can resolve it.
-LARGE_SCALE, SMALL_SCALE = 1.0, 1e-7
-#: Ratio of the longest to the middle axis above which a Gaussian counts as a needle. Flat discs are common, needles are
-#: not.
-NEEDLE = 1e3
+#: Size relative to the scene's extent above which a Gaussian is larger than the scene.
+LARGE_SCALE = 1.0
 #: Log scale above which the determinant of the projected covariance overflows: exp(177)^4 exceeds float64.
 OVERFLOW_SCALE = 177.0
 #: SH coefficients of trained scenes stay within a few units; 20 corresponds to a color of 6.
@@ -49,9 +43,9 @@ FAR_WORLD = 1e4
 HARDLY_SEEN = 1.0 / 255.0
 #: Total blend weight below which a Gaussian is in no view; sums of weights are 0 or much larger.
 _NO_WEIGHT = 1e-300
-#: Fields of view in degrees above and below which a view is reported. Above `WIDE`, perspective varies so much within
-#: one Gaussian that its linear approximation is inaccurate.
-WIDE, NARROW = 140.0, 1.0
+#: Field of view in degrees above which perspective varies so much within one Gaussian that its linear approximation is
+#: inaccurate.
+WIDE = 140.0
 #: Uncovered fraction of a view above which the view is reported.
 UNCOVERED = 0.01
 #: Aspect ratio of a style image beyond which it is reported.
@@ -143,26 +137,16 @@ def scene_findings(file: SceneFile) -> list[Finding]:
 
 
 def _questions(scene: Scene, extent: float) -> list[_Question]:
-    low, high = QUATERNION_LENGTHS
     rest = scene.sh_rest
     stored = rest.largest() if isinstance(rest, StoredHarmonics) else None
-
-    def length(part: slice) -> Tensor:
-        norms: Tensor = torch.linalg.vector_norm(scene.quats[part].double(), dim=1)
-        return norms
 
     def longest(part: slice) -> Tensor:
         return scene.scales[part].double().amax(dim=1)
 
     def relative(part: slice) -> Tensor:
-        return (longest(part) - math.log(extent)).clamp(-700, 700).exp()
-
-    def slender(part: slice) -> Tensor:
-        logarithms = scene.scales[part].double().sort(dim=1).values
-        return (logarithms[:, 2] - logarithms[:, 1]).clamp_max(700).exp()
-
-    def if_drawn(value: Callable[[slice], Tensor]) -> Callable[[slice], Tensor]:
-        return lambda part: torch.where(longest(part) <= OVERFLOW_SCALE, value(part), math.nan)
+        lengths = longest(part)
+        ratios = (lengths - math.log(extent)).clamp(-700, 700).exp()
+        return torch.where(lengths <= OVERFLOW_SCALE, ratios, math.nan)
 
     def opacity(part: slice) -> Tensor:
         return scene.opacities[part].double().sigmoid()
@@ -176,25 +160,14 @@ def _questions(scene: Scene, extent: float) -> list[_Question]:
         assert stored is not None
         return stored[part]
 
-    normalized = "normalized in float64, like all quaternions"
     covers = "drawn; each may cover all raster tiles of all views, which costs time and memory"
-    small = f"smaller than {SMALL_SCALE:g} of the scene's extent (value: fraction)"
-    needles = f"needles more than {NEEDLE:g} times as long as thick (value: ratio)"
-    exact = "drawn exactly: the determinant is a sum of positive terms, so nothing cancels"
     cubed = "unchanged; gradients grow with their third power, and a job stops if a gradient exceeds 1e19"
     reached = "; --target-loss may be reached at once, because they raise the initial loss"
     large = f"SH coefficients above {LARGE_COEFFICIENT:g}"
     questions = [
-        _Question(f"quaternion shorter than {low:g}", normalized, length, low, below=True),
-        _Question(f"quaternion longer than {high:g}", normalized, length, high),
         _Question("size that overflows (value: its logarithm)", "never drawn", longest, OVERFLOW_SCALE),
-        _Question("longer than the scene's extent (value: ratio)", covers, if_drawn(relative), LARGE_SCALE),
-        _Question(small, "drawn as a point, blurred over one pixel", relative, SMALL_SCALE, below=True),
-        _Question(needles, exact, if_drawn(slender), NEEDLE),
+        _Question("longer than the scene's extent (value: ratio)", covers, relative, LARGE_SCALE),
         _Question("opacity below 1/255", "neither drawn nor optimized", opacity, ALPHA_MIN, below=True),
-        _Question(
-            f"opacity above {ALPHA_MAX:g}", f"drawn with opacity {ALPHA_MAX:g}, as in training", opacity, ALPHA_MAX
-        ),
         _Question(f"DC {large}", cubed + reached, dc, LARGE_COEFFICIENT),
     ]
     return [*questions, _Question(f"higher {large}", cubed, higher, LARGE_COEFFICIENT)] if rest.shape[1] else questions
@@ -223,12 +196,7 @@ def _far_from_origin(file: SceneFile, center: Tensor, extent: float) -> list[Fin
     if far < FAR_WORLD:
         return []
     step = float(np.spacing(np.float32(center.abs().max())))
-    if file.header is not None and file.header.has_double_positions:
-        done = (
-            "positions become float32, which is too coarse here; subtract an offset from those of Gaussians and cameras"
-        )
-    else:
-        done = "the file's float32 positions are too coarse here; move the scene to the origin before training"
+    done = "float32 positions are too coarse here; subtract an offset from those of Gaussians and cameras"
     worst = f"center {far:.3g} extents away; positions are {step:.3g} apart, {step / extent:.1e} of the extent"
     return [Finding("scene", "scene far from its origin", total, total, worst, done)]
 
@@ -285,14 +253,13 @@ def _placed(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Findin
         f"drawn; the perspective is linearized at each Gaussian's center, or at most {FRUSTUM_MARGIN:.0%} of half the "
         "view's width outside the view"
     )
-    drawn, skipped = "drawn like any other view", "feature layers without a cell are skipped in its loss"
+    skipped = "feature layers without a cell are skipped in its loss"
     behind = "not drawn if they are in front of the near plane; use --near to move it"
     outside = "principal point outside the image (value: widths from its center)"
     inside = f"camera inside the scene: Gaussians within {near:g} of it (value: count)"
     rows = [
         (f"field of view above {WIDE:g} degrees", angles, [angle > WIDE for angle in angles], linearized),
-        (f"field of view below {NARROW:g} degree", angles, [angle < NARROW for angle in angles], drawn),
-        (outside, off, [value > 0.5 for value in off], f"{drawn}; check that this is intended"),
+        (outside, off, [value > 0.5 for value in off], "drawn like any other view; check that this is intended"),
         (f"fewer than {ALIGNMENT} pixels on a side", small, [value < ALIGNMENT for value in small], skipped),
         (inside, close, [count > 0 for count in close], behind),
     ]

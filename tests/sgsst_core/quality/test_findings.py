@@ -54,7 +54,9 @@ def finding_about(findings: dict[str, Finding], text: str) -> Finding:
 
 
 def test_ordinary_scene_has_no_findings(tmp_path: Path) -> None:
-    scene = replace(wall(), opacities=torch.full((len(wall()),), -1.0))
+    scene = wall()
+    scene.quats[:2] *= torch.tensor([[1e-20], [1e20]])  # drawn exactly, as needles are
+    scene.scales[6] = torch.tensor([0.5, 1e-5, 1e-12]).log()
     assert findings_in(tmp_path, scene) == {}
     # The wall extends beyond what its cameras see of it.
     findings = seen_by(tmp_path, wall(), cameras())
@@ -65,13 +67,9 @@ def test_ordinary_scene_has_no_findings(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("column", "rows", "value", "what", "worst"),
     [
-        ("quats", [3], 1e-20, "quaternion shorter than 0.001", "Gaussian 3: 2e-20"),
-        ("quats", [3], 1e20, "quaternion longer than 1000", "Gaussian 3: 2e+20"),
         ("scales", [5, 6], 200.0, "size that overflows", "Gaussian 5: 200"),
         ("scales", [7], 5.0, "longer than the scene's extent", "Gaussian 7: "),
-        ("scales", [7, 8, 9], -1e6, "smaller than 1e-07", "Gaussian 7: "),
         ("opacities", [11, 12], -20.0, "opacity below 1/255", "Gaussian 11: 2.06e-09"),
-        ("opacities", [11], 30.0, "opacity above 0.99", "Gaussian 11: 1"),
         ("sh_dc", [2, 13], -1e4, "DC SH coefficients above 20", "Gaussian 2: 1e+04"),
         ("sh_rest", [13], 50.0, "higher SH coefficients above 20", "Gaussian 13: 50"),
     ],
@@ -98,14 +96,6 @@ def test_gaussians_close_to_cameras_match_all_distances(distance: float, far: fl
     expected = [int(((means.double() - center).norm(dim=1) < distance).sum()) for center in centers]
     assert findings.closer(means, centers, distance) == expected
     assert max(expected) > 0
-
-
-def test_needles_are_reported_and_discs_are_not(tmp_path: Path) -> None:
-    scene = wall()
-    scene.scales[:] = torch.tensor([0.1, 0.1, 1e-6]).log()
-    scene.scales[6] = torch.tensor([0.5, 1e-5, 1e-6]).log()
-    finding = finding_about(findings_in(tmp_path, scene), "needles")
-    assert (finding.count, finding.worst) == (1, "Gaussian 6: 5e+04")
 
 
 def test_invalid_rows_are_reported_with_file_indices(tmp_path: Path) -> None:
@@ -170,13 +160,11 @@ def test_extreme_lenses_and_sizes_are_reported(tmp_path: Path) -> None:
     view = cameras(1)[0]
     views = [
         replace(view, name="wide", fx=3.0, fy=3.0),
-        replace(view, name="narrow", fx=1e5, fy=1e5),
         replace(view, name="shifted", cx=-70.0),
         replace(view, name="small", height=9, cy=4.5),
     ]
     findings = seen_by(tmp_path, wall(), views)
     assert finding_about(findings, "above 140 degrees").worst.startswith("'wide': 169")
-    assert finding_about(findings, "below 1 degree").worst.startswith("'narrow'")
     assert finding_about(findings, "principal point").worst.startswith("'shifted'")
     assert finding_about(findings, "fewer than 16 pixels on a side").worst == "'small': 9"
 
