@@ -252,7 +252,7 @@ UNSURE_UP = ProblemType(
     "The scene does not show which way is up: {reason}. Set `up`: {likely} is likely.",
     members=("input", "candidates"),
     example={
-        "reason": "neither a ground nor a side to rest on was found, and most captures point this way",
+        "reason": "neither a ground nor one side to rest on was found, and most captures point this way",
         "likely": "-y or z",
         "candidates": ["-y", "z"],
         "input": "up",

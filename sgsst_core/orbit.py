@@ -41,8 +41,8 @@ _VISIBLE = 0.03
 _DIRECTIONS = 300
 #: Up in most captures, since COLMAP's y points down.
 USUAL_UP = (0.0, -1.0, 0.0)
-#: Up in programs that model scenes, such as Blender, and in most captures whose axes are not COLMAP's.
-_SECOND_UP = (0.0, 0.0, 1.0)
+#: Up in most captures; and in programs that model scenes, such as Blender, and most captures with other axes.
+_CONVENTIONS = ("-y", "z")
 #: Directions this close to a world axis are replaced by it, because captures are mostly aligned by hand. The longest
 #: axis of a standing subject shows up less precisely than a ground does: a pose or a drapery tilts it.
 _SNAP, _SNAP_STANDING = math.cos(math.radians(10)), math.cos(math.radians(15))
@@ -54,7 +54,7 @@ _LAYER, _END, _END_OF_HEIGHT = 0.01, 0.12, 0.25
 _GROUND, _OTHER_END = 0.7, 0.6
 #: Cells along the longer side of a grid over a layer.
 _GROUND_CELLS = 24
-#: A scene with a larger fraction of background or strays is not taken for a standing object.
+#: A scene with a larger fraction of background or strays is not taken for a single object.
 _WHOLE = 0.03
 #: A subject counts as standing if its length is at least this multiple of its width (by standard deviation).
 _STANDS = 1.6
@@ -89,11 +89,6 @@ class Subject:
     def size(self) -> float:
         """Largest distance between two points of the hull."""
         return float(torch.cdist(self.hull, self.hull).amax())
-
-    def holds(self, means: Tensor) -> Tensor:
-        """Return the mask [N] bool of points [N, 3] that lie in the bounding box of the subject."""
-        low, high = self.hull.amin(0), self.hull.amax(0)
-        return ((means >= low.to(means)) & (means <= high.to(means))).all(1)
 
 
 def find_subject(scene: Scene) -> Subject:
@@ -206,20 +201,17 @@ class Up:
         reason: Display text, such as "a flat layer lies under all of it".
         sure: Whether the scene determines the direction; False if it relies on the usual convention.
         ground: Whether there is a ground under the subject, which hides it from below.
-        other: [3] float64, the second most likely direction if the scene does not determine it; None if it does.
     """
 
     direction: Tensor
     reason: str
     sure: bool = True
     ground: bool = False
-    other: Tensor | None = None
 
     @property
     def candidates(self) -> list[str]:
-        """World axes nearest to the direction and to the other one, such as ["-y", "z"]."""
-        directions = [self.direction] if self.other is None else [self.direction, self.other]
-        return [Up(_nearest_axis(each), "").name for each in directions]
+        """World axis nearest to the direction, or both conventions if the scene does not determine it."""
+        return [Up(_nearest_axis(self.direction), "").name] if self.sure else [*_CONVENTIONS]
 
     @property
     def name(self) -> str:
@@ -235,8 +227,7 @@ def find_up(subject: Subject) -> Up:
     """Estimate the up direction.
 
     A ground plane shows it, or the wider end of a long subject, unless the subject rests more firmly on another side.
-    Without both, it is the only side on which the subject rests firmly. Else it is -y, the usual convention, or one of
-    two sides on which it rests about as firmly.
+    Without both, it is the only side on which the subject rests firmly. Else it is -y, the usual convention.
     """
     axes = _axes_of(subject.points, subject.weights)
     world = torch.eye(3, dtype=torch.float64)
@@ -249,28 +240,19 @@ def find_up(subject: Subject) -> Up:
             same = [balance for balance, up in balances if float(up @ shown.direction) > _SAME]
             if margin * max([_balance(subject, shown.direction), *same]) >= max(others, default=0.0):
                 return shown
-    return _resting(balances)
-
-
-def _resting(balances: Sequence[tuple[float, Tensor]]) -> Up:
-    """Return the up direction of a subject without ground or foot, given how firmly it rests on each of its sides."""
     firmest = max((balance for balance, _ in balances), default=0.0)
-    usual, second = (torch.tensor(up, dtype=torch.float64) for up in (USUAL_UP, _SECOND_UP))
-    similar = [each for each in balances if each[0] >= _SIMILAR * firmest > 0]
+    similar = [up for balance, up in balances if balance >= _SIMILAR * firmest > 0]
     if len(similar) == 1 and firmest >= _FIRM:
-        return Up(similar[0][1], "the subject rests firmly on this side, and on no other one")
-    similar.sort(key=lambda each: (float(each[1] @ usual) < _SAME, -each[0]))
-    likely = [up for _, up in similar] if len(similar) <= 2 else []
-    if not likely or firmest < _FIRM or float(likely[0] @ likely[-1]) < 0:  # a panel may stand as well as lie
-        likely = [usual, *likely]
-    likely = [*likely, usual, second]
-    other = next(up for up in likely if float(up @ likely[0]) < _SAME)
-    sides = "the subject may rest on several sides" if similar else "neither a ground nor a side to rest on was found"
-    return Up(likely[0], f"{sides}, and most captures point this way", sure=False, other=other)
+        return Up(similar[0], "the subject rests firmly on this side, and on no other one")
+    reason = "neither a ground nor one side to rest on was found, and most captures point this way"
+    return Up(torch.tensor(USUAL_UP, dtype=torch.float64), reason, sure=False)
 
 
 def _standing(subject: Subject, axes: Tensor) -> Up | None:
-    """Return the up direction of a subject that stands along the longest of its `axes`; None if it has no long one."""
+    """Return the up direction of a subject that stands along the longest of its `axes`, on its wider end.
+
+    None if it has no long one, or both ends are alike.
+    """
     long = axes[:, 2]
     offsets = subject.points - (subject.weights[:, None] * subject.points).sum(0)
     spreads = (offsets @ axes).square().mul(subject.weights[:, None]).sum(0).sqrt()
@@ -278,21 +260,11 @@ def _standing(subject: Subject, axes: Tensor) -> Up | None:
     if longer < _STANDS or subject.left_out > _WHOLE:
         return None
     ends = [_foot(subject, long), _foot(subject, -long)]
-    stands = f"the subject is {longer:.1f} times as tall as wide"
-    if max(ends) > max(_MIN_FOOT, _WIDER * min(ends)):
-        up = long if ends[0] > ends[1] else -long
-        broader = f"{max(ends) / min(ends):.1f} times as broad as" if max(ends) < 100 * min(ends) else "broader than"
-        return Up(_snapped(up, _SNAP_STANDING), f"{stands}, and its foot is {broader} the other end")
-    up = _snapped(long if _habit(long) > 0 else -long, _SNAP_STANDING)
-    usual = torch.tensor(USUAL_UP, dtype=torch.float64)
-    reason = f"{stands}; both ends are alike, and most captures point this way"
-    return Up(up, reason, sure=False, other=usual if abs(float(up @ usual)) < _SNAP else -up)
-
-
-def _habit(direction: Tensor) -> float:
-    """Return a positive number if a direction is the usual one of its axis: -y (COLMAP), +z (Blender) or +x."""
-    x, y, z = (float(value) for value in direction)
-    return -y if abs(y) >= max(abs(x), abs(z)) else z if abs(z) >= abs(x) else x
+    if max(ends) <= max(_MIN_FOOT, _WIDER * min(ends)):
+        return None
+    broader = f"{max(ends) / min(ends):.1f} times as broad as" if max(ends) < 100 * min(ends) else "broader than"
+    reason = f"the subject is {longer:.1f} times as tall as wide, and its foot is {broader} the other end"
+    return Up(_snapped(long if ends[0] > ends[1] else -long, _SNAP_STANDING), reason)
 
 
 def _snapped(direction: Tensor, close: float = _SNAP) -> Tensor:
@@ -729,10 +701,6 @@ _ENOUGH = 0.7
 _HARDLY, _INSIDE = 0.02, 0.3
 #: Trial views: number in a ring at elevation 0, resolution, and number of sampled Gaussians.
 _TRIALS, _TRIAL_SIDE, _TRIAL_GAUSSIANS = 8, 160, 50_000
-#: If the subject makes up less than this fraction of a view, other objects are assumed to hide it.
-_SHOWS = 0.7
-#: Maximum fraction of a scene outside its subject without a warning.
-_OUTSIDE = 0.03
 
 
 @dataclass(frozen=True)
@@ -763,9 +731,7 @@ class Orbit:
         radius: Distance of the cameras from the center of the subject in world units.
         tried: Elevations that were tried.
         shown: Surface that the rings show, as a fraction of what all tried rings would show.
-        next: Fraction of that surface that the best remaining ring would add; None if no ring remains.
         outside: Fraction of the scene that is not part of the subject.
-        hidden: Fraction of the trial views in which other objects hide too much of the subject.
         inside: Fraction of the surface that no trial view shows.
     """
 
@@ -775,9 +741,7 @@ class Orbit:
     radius: float
     tried: tuple[float, ...]
     shown: float
-    next: float | None
     outside: float
-    hidden: float
     inside: float
 
 
@@ -796,30 +760,19 @@ def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = N
     rings = request.count // _MIN_VIEWS if request.count is not None else 1 + len(_ABOVE + _BELOW)
     tried = [first]
     if request.elevation is None and rings > 1:
-        alone = not up.ground and subject.left_out <= _OUTSIDE
+        alone = not up.ground and subject.left_out <= _WHOLE
         tried += [*_ABOVE, *(_BELOW if alone else ())]
     trial = _Trial(scene, subject, up, request, remaining)
-    areas, fractions = zip(*(trial.of_ring(elevation) for elevation in tried), strict=True)
-    chosen, shown, left = _needed(areas, max(rings, 1))
+    areas = [trial.of_ring(elevation) for elevation in tried]
+    chosen, shown = _needed(areas, max(rings, 1))
     elevations = tuple(tried[ring] for ring in chosen)
     count = request.count
     if count is None:
         count = sum(max(_MIN_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
     cameras = trial.cameras(count, elevations)
     radius = float((cameras[0].center - middle_of(subject, up.direction)).norm())
-    hidden = [fraction < _SHOWS for ring in chosen for fraction in fractions[ring]]
-    return Orbit(
-        cameras,
-        up,
-        elevations,
-        radius,
-        tuple(tried),
-        shown,
-        left,
-        subject.left_out,
-        sum(hidden) / len(hidden),
-        trial.hidden_fraction(areas),
-    )
+    inside = trial.hidden_fraction(areas)
+    return Orbit(cameras, up, elevations, radius, tuple(tried), shown, subject.left_out, inside)
 
 
 def find_upright_subject(
@@ -842,13 +795,8 @@ def find_upright_subject(
     return subject, up if up.sure or subject is whole else find_up(whole)
 
 
-def orbit_decisions(orbit: Orbit, cameras: Sequence[Camera], uncovered: Sequence[float] | None) -> list[Decision]:
-    """Return the decisions about an orbit.
-
-    Args:
-        cameras: Its cameras at the sizes used for stylization.
-        uncovered: Fraction of uncovered pixels of each view; None if unknown.
-    """
+def orbit_decisions(orbit: Orbit, count: int) -> list[Decision]:
+    """Return the decisions about an orbit, of whose cameras `count` are used."""
     decisions = [Decision("up", orbit.up.name, orbit.up.reason)]
     *others, last = [f"{angle:g}" for angle in orbit.elevations]
     angles = f"{', '.join(others)} and {last}" if others else last
@@ -857,23 +805,14 @@ def orbit_decisions(orbit: Orbit, cameras: Sequence[Camera], uncovered: Sequence
     if len(orbit.tried) > 1:
         tried = f"rings at {min(orbit.tried):g} to {max(orbit.tried):g} degrees"
         reason = f"they show {orbit.shown:.0%} of the surface that {tried} show"
-        reason += f"; another ring would add {orbit.next:.1%}" if orbit.next is not None else ""
-    views = f"{len(cameras)} view{'s' if len(cameras) > 1 else ''}"
+    views = f"{count} view{'s' if count > 1 else ''}"
     decisions.append(
         Decision("cameras", f"{views} in {rings} at {angles} degrees, {orbit.radius:.3g} from the center", reason)
     )
-    sizes = sorted({(camera.width, camera.height) for camera in cameras})
-    shapes = f"{sizes[0][0]}x{sizes[0][1]}"
-    shapes += f" to {sizes[-1][0]}x{sizes[-1][1]}, {len(sizes)} shapes" if len(sizes) > 1 else ""
-    if uncovered is not None:
-        covered = [1 - fraction for fraction in uncovered]
-        shown = f"the scene covers {sum(covered) / len(covered):.0%} of their pixels (at least {min(covered):.0%})"
-        decisions.append(Decision("frames", shapes, f"fitted to the subject's shape; {shown}"))
-    outside, hidden = f"{orbit.outside:.0%} of the scene lies", f"in {orbit.hidden:.0%} of the views, other objects"
+    outside = f"{orbit.outside:.0%} of the scene lies outside the frames"
     inside = f"{orbit.inside:.0%} of the scene lies inside, hidden from all views around it"
     doubts = (
-        (orbit.outside > _OUTSIDE, f"{outside} outside the frames", "it is not a single object"),
-        (orbit.hidden > 0, f"{hidden} hide the subject", "the cameras stand outside of its surroundings"),
+        (orbit.outside > _WHOLE, outside, "it is not a single object"),
         (orbit.inside > _INSIDE, inside, "it may be a room"),
     )
     for doubted, text, reason in doubts:
@@ -891,7 +830,6 @@ class _Trial:
         colorless = replace(scene, sh_rest=scene.means.new_zeros((len(scene), 0, 3)))
         self._scene = sampled(colorless, _TRIAL_GAUSSIANS)
         self._rasterizer = make_rasterizer("cpu", self._scene, near=request.near)
-        self._framed = subject.holds(self._scene.means)
         self._cropped = None if remaining is None else ~remaining[sampled_rows(len(scene), _TRIAL_GAUSSIANS)]
 
     def cameras(self, count: int, elevations: Sequence[float]) -> list[Camera]:
@@ -908,31 +846,25 @@ class _Trial:
         shown = torch.stack(list(areas)).amax(0)
         return float(surface[shown < _HARDLY * surface].sum() / surface.sum().clamp_min(1e-300))
 
-    def of_ring(self, elevation: float) -> tuple[Tensor, list[float]]:
-        """Render the trial views of a ring.
+    def of_ring(self, elevation: float) -> Tensor:
+        """Return the visible area of each Gaussian in the trial view of a ring that shows most of it, [n].
 
-        Returns:
-            Visible area of each Gaussian in the view that shows most of it, [n], in squared world units; and for each
-            view that shows anything, the fraction of the visible area that belongs to the subject.
+        Areas are in squared world units.
         """
         count = max(4, round(_TRIALS * math.cos(math.radians(elevation))))
         areas = torch.zeros(len(self._scene), dtype=torch.float64)
-        subject = []
         for camera in self.cameras(count, [elevation]):
             small = resized(camera, _TRIAL_SIDE)
             weights = self._rasterizer.survey(small)[1].double()
             depths = self._scene.means.double() @ small.world_to_camera[2, :3] + small.world_to_camera[2, 3]
             # area of a pixel at this depth, perpendicular to the view
-            shown = weights * (depths / small.fx) ** 2
-            areas = torch.maximum(areas, shown)
-            if float(shown.sum()) > 0:
-                subject.append(float(shown[self._framed].sum() / shown.sum()))
+            areas = torch.maximum(areas, weights * (depths / small.fx) ** 2)
         if self._cropped is not None:
             areas[self._cropped] = 0
-        return areas, subject or [1.0]
+        return areas
 
 
-def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float, float | None]:
+def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float]:
     """Choose rings greedily: the first one, then repeatedly the one that adds most surface, until the gain is small.
 
     For each Gaussian, the view that shows most of it counts. The surface that a set of rings shows is the sum of these
@@ -944,8 +876,7 @@ def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float, float
         most: Maximum number of rings to choose.
 
     Returns:
-        Indices of the chosen rings, ascending; fraction of the surface that they show; and fraction that the best other
-        ring would add (None if there is none).
+        Indices of the chosen rings, ascending, and fraction of the surface that they show.
     """
     best_of_all = torch.stack(list(areas)).amax(0)
     areas = [(area / _ENOUGH).minimum(best_of_all) for area in areas]
@@ -959,6 +890,6 @@ def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float, float
         }
         best = max(gains, key=lambda ring: gains[ring], default=None)
         if best is None or gains[best] < _LITTLE or len(chosen) >= most:
-            return sorted(chosen), float(covered.sum()) / total, gains[best] if best is not None else None
+            return sorted(chosen), float(covered.sum()) / total
         chosen.append(best)
         covered = torch.maximum(covered, areas[best])

@@ -351,7 +351,7 @@ class UpView(BaseModel):
     """Up direction of an orbit."""
 
     model_config = _with_example(
-        direction="-y", sure=False, candidates=["-y", "z"], reason="neither a ground nor a side to rest on was found"
+        direction="-y", sure=False, candidates=["-y", "z"], reason="neither a ground nor one side to rest on was found"
     )
 
     direction: str = Field(description="Axis, such as `-y`, or three components.")

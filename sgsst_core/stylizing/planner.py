@@ -183,7 +183,7 @@ def _about_inputs(
     if inputs.refinement is not None:
         yield refine_decision(inputs.refinement, settings)
     if inputs.orbit is not None:
-        yield from orbit_decisions(inputs.orbit, fitted, survey.uncovered)
+        yield from orbit_decisions(inputs.orbit, len(fitted))
     style, regions = inputs.style, inputs.regions
     if regions is not None:
         yield from region_decisions(regions, survey.total_blend_weights, [fitted[index] for index in survey.covered])

@@ -28,7 +28,6 @@ from sgsst_core.orbit import (
     orbit_decisions,
     turntable,
 )
-from sgsst_core.planning.survey import survey_views
 from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
@@ -50,8 +49,6 @@ def test_extent_of_a_box_includes_the_extents_of_its_gaussians() -> None:
     assert torch.allclose(extent(OBJECT), torch.stack([-corner, corner]), atol=0.01)
     subject = find_subject(OBJECT)
     assert (subject.left_out, float(subject.weights.sum())) == (pytest.approx(0, abs=1e-9), pytest.approx(1))
-    assert bool(subject.holds(OBJECT.means).all())
-    assert not bool(subject.holds(torch.tensor([[0.0, 1.6, 0.0]])).any())
 
 
 STRAYS = {
@@ -228,24 +225,6 @@ def test_up_is_conventional_without_evidence(scene: Scene) -> None:
     assert "most captures" in up.reason
 
 
-@pytest.mark.parametrize(("normal", "candidates"), [(0, ["y", "x"]), (1, ["y", "y"]), (2, ["y", "z"])])
-def test_panel_may_stand_or_lie(normal: int, candidates: list[str]) -> None:
-    points = box((-3, -1, -3), (3, -0.9, 3)).roll(normal - 1, 1)
-    up = up_of(scene_of(points))
-    assert not up.sure
-    assert ([each.removeprefix("-") for each in up.candidates], up.name) == (candidates, "-y")
-
-
-@pytest.mark.parametrize(("along", "name"), [(0, "x"), (1, "-y"), (2, "z")])
-def test_stick_stands_along_its_axis_in_the_conventional_sense(along: int, name: str) -> None:
-    points = torch.zeros(400, 3)
-    points[:, along] = torch.linspace(-1, 1, 400)
-    up = up_of(scene_of(points))
-    assert up.name == name
-    assert not up.sure
-    assert "both ends are alike" in up.reason
-
-
 def test_up_snaps_to_a_close_world_axis_only() -> None:
     assert up_of(moved(figure(), Rotation.from_euler("x", 13, degrees=True))).name == "-y"
     slanted = up_of(moved(figure(), Rotation.from_euler("x", 30, degrees=True)))
@@ -385,8 +364,7 @@ ODD = {
 @pytest.mark.parametrize("name", ODD)
 def test_degenerate_scenes_have_cameras_that_see_them(name: str) -> None:
     scene = ODD[name]
-    subject = find_subject(scene)
-    seen = scene.means[subject.holds(scene.means)] if name == "a far outlier" else scene.means
+    seen = figure().means if name == "a far outlier" else scene.means
     for view in orbit(scene, 6, elevations=[10.0, 40.0]):
         assert bool(torch.isfinite(view.world_to_camera).all())
         assert math.isfinite(view.fx)
@@ -440,11 +418,9 @@ def test_turntable_of_a_point_or_from_within_is_finite() -> None:
 REQUEST = OrbitRequest(count=12)
 
 
-def plan_lines(scene: Scene, orbit: Orbit) -> dict[str, Decision]:
+def plan_lines(orbit: Orbit) -> dict[str, Decision]:
     """Return the plan's decisions about an orbit by item."""
-    cameras = [resized(camera, 64) for camera in orbit.cameras]
-    survey = survey_views(scene, cameras, make_rasterizer("cpu", scene))
-    return {decision.item: decision for decision in orbit_decisions(orbit, cameras, survey.uncovered)}
+    return {decision.item: decision for decision in orbit_decisions(orbit, len(orbit.cameras))}
 
 
 def table() -> Scene:
@@ -466,8 +442,6 @@ def test_pole_gets_no_views_from_above() -> None:
     pole = scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01)
     orbit = make_orbit(pole, OrbitRequest(count=24))
     assert (max(orbit.elevations), max(orbit.tried)) == (10, 70)
-    assert orbit.next is not None
-    assert orbit.next < 0.03
 
 
 def test_automatic_view_count_is_bounded_and_grows_with_the_rings() -> None:
@@ -492,7 +466,7 @@ def test_requested_properties_are_used() -> None:
     angles = [elevation(camera, middle, orbit.up.direction) for camera in orbit.cameras]
     assert angles == pytest.approx([35.0] * 14)
     assert orbit.radius == pytest.approx(6.5)
-    decisions = plan_lines(scene, orbit)
+    decisions = plan_lines(orbit)
     assert (decisions["up"].decision, decisions["up"].reason) == ("z", "requested")
     assert decisions["cameras"].decision == "14 views in a ring at 35 degrees, 6.5 from the center"
     assert decisions["cameras"].reason == "requested"
@@ -511,7 +485,6 @@ def test_orbit_surrounds_what_remains_of_a_cropped_scene() -> None:
         assert torch.allclose(camera.world_to_camera, expected.world_to_camera)
         assert camera.fx == expected.fx
     assert whole.radius > 1.5 * orbit.radius
-    assert orbit.hidden > 0, "the rest of the scene still stands in front"
 
 
 def test_ground_outside_a_crop_shows_where_up_is() -> None:
@@ -547,12 +520,11 @@ def test_up_direction_of_the_file_is_used(tmp_path: Path, comment: str, up: str,
 def test_plan_lines_state_the_reasons_of_an_orbit() -> None:
     scene = figure()
     orbit = make_orbit(scene, OrbitRequest(count=24))
-    decisions = plan_lines(scene, orbit)
+    decisions = plan_lines(orbit)
     assert decisions["up"].decision == "-y"
     assert "times as tall as wide" in decisions["up"].reason
     assert decisions["cameras"].decision.startswith(f"24 views in {len(orbit.elevations)} rings at 10")
     assert f"{orbit.shown:.0%} of the surface" in decisions["cameras"].reason
-    assert "% of their pixels" in decisions["frames"].reason
     assert "subject" not in decisions
 
 
@@ -566,7 +538,7 @@ def test_plan_lines_state_the_reasons_of_an_orbit() -> None:
 def test_plan_warns_that_a_room_is_not_a_single_object(surroundings: Scene, what: str) -> None:
     scene = joined(scene_of(ball((0, 0, 0), 0.5, 5000), 0.05), surroundings)
     orbit = make_orbit(scene, OrbitRequest(count=12))
-    warning = plan_lines(scene, orbit)["subject"]
+    warning = plan_lines(orbit)["subject"]
     assert warning.decision.startswith("warning: ")
     assert what in warning.decision
     assert "--cameras" in warning.reason

@@ -171,7 +171,7 @@ def test_orbit_needs_no_camera_file(files: Files) -> None:
     assert main(command[:at] + command[at + 2 :]) == 0
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
     assert report["cameras"]["source"] == "orbit"
-    assert [decision["item"] for decision in report["plan"]["decisions"][:3]] == ["up", "cameras", "frames"]
+    assert [decision["item"] for decision in report["plan"]["decisions"][:2]] == ["up", "cameras"]
     with Image.open(files.out.with_name("stylized.views.jpg")) as views:
         assert views.format == "JPEG"
     assert "Views of the orbit" in files.out.with_name("stylized.report.html").read_text()
