@@ -213,8 +213,8 @@ class LossTerms:
         return LossTerms(*(value / count for value in vars(self).values()))
 
 
-#: Terms of the statistics: name in files and reports, and display name.
-STATISTICS_TERMS = {"gram": "Gram matrix", "mean": "mean", "std": "standard deviation"}
+#: Names of the terms of the statistics in files and reports.
+STATISTICS_TERMS = ("gram", "mean", "std")
 
 
 #: Numerator of w_G = GRAM_WEIGHT / c^2.
@@ -992,9 +992,8 @@ class NearestTerm:
 # --- all terms -------------------------------------------------------------------------------------------------------
 
 
-#: Terms whose sum is the loss of a scale: name in files and reports, and display name. Summation, display and chart
-#: colors follow this order.
-TERMS = STATISTICS_TERMS | {ContentTerm.name: "content", NearestTerm.name: "nearest neighbors"}
+#: Names of the terms whose sum is the loss of a scale, in the order of summation.
+TERMS = (*STATISTICS_TERMS, ContentTerm.name, NearestTerm.name)
 #: Terms that are sums over the positions of a view. Every tile adds the positions that it owns.
 POSITION_TERMS = (ContentTerm, NearestTerm)
 PositionTerm = ContentTerm | NearestTerm

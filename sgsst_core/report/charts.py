@@ -1,4 +1,4 @@
-"""Charts of a report: its history as columns, with running means on logarithmic axes, as PNG and as inline SVG.
+"""Chart of a report: its losses as columns, with running means on logarithmic axes, as PNG and as inline SVG.
 
 In SVG, colors are CSS variables with the printed color as fallback (`var(--c-222222, #222222)`), so a page can replace
 them on dark screens. Text uses the page's font.
@@ -10,10 +10,9 @@ import io
 import math
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +27,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.loss.terms import TERMS
 from sgsst_core.report.images import GRID, INK, color_of
 
 Floats = NDArray[np.float64]
@@ -64,8 +62,9 @@ STYLE: dict[Any, Any] = {
 #: Label of the y axis of loss charts.
 RELATIVE_LOSS = "loss, relative to the unstylized scene"
 _PHASE_NAMES = {"coarse": "coarsest scale", "sos": "all scales"}
-#: Size in inches. At this width, text is legible on a phone, and two charts fit side by side on a desktop screen.
-_WIDTH, _HEIGHT = 5.6, 3.5
+#: Size in inches. At this width, text is legible on a phone.
+_SIZE = (5.6, 3.5)
+_TITLE = "Loss, relative to the start"
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,6 @@ class History:
         x: Elapsed seconds, and number of steps.
         limits: Limits of each x axis, which include the measurements of novel views.
         phases: Name of each phase's stage, and slice of its steps.
-        terms: Loss terms by scale and name.
         relative: Loss by scale, relative to the unstylized scene.
         mean_relative: Mean over scales, relative to the unstylized scene; NaN for steps on a single scale.
         round_length: Number of steps in which every view occurs once.
@@ -101,7 +99,6 @@ class History:
     x: dict[Against, Floats]
     limits: dict[Against, tuple[float, float]]
     phases: list[tuple[str, slice]]
-    terms: dict[int, dict[str, Floats]]
     relative: dict[int, Floats]
     mean_relative: Floats
     round_length: int
@@ -124,16 +121,13 @@ def history_of(report: dict[str, Any]) -> History:
     for stage, run in groupby(record["stage"] for record in records):
         start = phases[-1][1].stop if phases else 0
         phases.append((stage, slice(start, start + len(list(run)))))
-
-    def of_scale(scale: int, term: str) -> Floats:
-        return column([record["scales"].get(str(scale), {}).get(term) for record in records])
-
+    losses = {
+        scale: column([record["scales"].get(str(scale), {}).get("total") for record in records]) for scale in scales
+    }
     several = [len(record["scales"]) > 1 for record in records]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        relative = {scale: of_scale(scale, "total") / starts[scale] for scale in scales}
+        relative = {scale: losses[scale] / starts[scale] for scale in scales}
     moments = novel_view_moments(report)
-    split = [terms for record in records for terms in record["scales"].values()]
-    terms = [term for term in TERMS if any(own.get(term) for own in split)] or list(TERMS)  # those that are not 0
     return History(
         x=x,
         limits={
@@ -141,7 +135,6 @@ def history_of(report: dict[str, Any]) -> History:
             for against in AGAINST
         },
         phases=phases,
-        terms={scale: {term: of_scale(scale, term) for term in terms} for scale in scales},
         relative=relative,
         mean_relative=np.where(several, column([record["relative"] for record in records]), math.nan),
         round_length=round_length(report),
@@ -355,65 +348,30 @@ class PageFigure:
     """Chart of the page.
 
     Attributes:
-        name: Prefix of element IDs in the SVG, in lower-case letters.
-        svg: <svg> element by quantity of the x axis.
+        svg: <svg> element by quantity of the x axis, all of the same size.
     """
 
-    name: str
     title: str
     caption: str
     svg: dict[Against, str]
 
 
-def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
-    """Draw the charts of a report; return an empty list if no step was made."""
+def draw_figure(report: dict[str, Any]) -> PageFigure | None:
+    """Draw the chart of a report; return None if no step was made."""
     if not report["history"]:
-        return []
-    history = history_of(report)
-    moments = novel_view_moments(report)
+        return None
+    history, moments = history_of(report), novel_view_moments(report)
     losses = column([terms["total"] for record in report["history"] for terms in record["scales"].values()])
     undrawn, caption = int((~_drawable(losses)).sum()), "Loss, divided by that of the unstylized scene."
     if undrawn:  # a logarithmic axis cannot show them
         caption += f" Not shown: {undrawn:,} of {len(losses):,} values, which are zero or not finite."
-    draw: Callable[[Figure, Against], None] = partial(_draw_loss, history=history, moments=moments)
-    loss = _figure("loss", "Loss, relative to the start", caption, draw)
-    caption, draw = "The loss of a scale is the sum of these terms.", partial(_draw_split, history=history)
-    return [loss, _figure("split", "Terms of the loss", caption, draw, rows=math.ceil(len(history.terms) / 2))]
-
-
-def _figure(name: str, title: str, caption: str, draw: Callable[[Figure, Against], None], rows: int = 1) -> PageFigure:
-    """Draw a chart for each x axis at the same size, so that switching between them does not shift the page."""
     svg = {}
     for against in AGAINST:
         with matplotlib.rc_context(STYLE):
-            figure = Figure(figsize=(_WIDTH, _HEIGHT + 2.0 * (rows - 1)), layout="constrained")
-            draw(figure, against)
-            label = f"{title}, against {against}"
-            svg[against] = inline(figure, f"{name}-{against}", label)
-    return PageFigure(name, title, caption, svg)
-
-
-def _draw_split(figure: Figure, against: Against, history: History) -> None:
-    count = len(history.terms)
-    grid = list(figure.subplots(math.ceil(count / 2), min(count, 2), sharey=True, squeeze=False).flat)
-    everything = [values for terms in history.terms.values() for values in terms.values()]
-    for axes, (scale, terms) in zip(grid, history.terms.items(), strict=False):
-        # Each panel has its own x limits. With shared limits, a first phase on the coarsest scale would squeeze the
-        # curves of all other scales into the end of the axis.
-        there = history.x[against][np.any([~np.isnan(values) for values in terms.values()], axis=0)]
-        own = replace(history, limits={**history.limits, against: log_limits(there, X_MARGIN)})
-        for term, values in terms.items():
-            _draw_line(axes, own, against, values, color_of(list(TERMS).index(term)), TERMS[term])
-        axes.set_title(scale_name(scale))
-        set_log_x(axes, own.limits[against], against)
-        set_log_y(axes, everything)
-    for axes in grid[: max(count - 2, 0)]:  # another panel is below
-        axes.set_xlabel("")
-    for axes in grid[::2]:
-        axes.set_ylabel("loss")
-    for axes in grid[count:]:
-        axes.set_visible(False)
-    draw_legend(figure, in_row=4)
+            figure = Figure(figsize=_SIZE, layout="constrained")
+            _draw_loss(figure, against, history, moments)
+            svg[against] = inline(figure, f"loss-{against}", f"{_TITLE}, against {against}")
+    return PageFigure(_TITLE, caption, svg)
 
 
 # --- SVG that can share a page with other figures ------------------------------------------------------------------

@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.progress import NOTHING, byte_count, duration, number, percent
-from sgsst_core.report.charts import AGAINST, BINS, draw_figures, novel_view_moments, round_length
+from sgsst_core.report.charts import AGAINST, BINS, draw_figure, novel_view_moments, round_length
 from sgsst_core.report.images import ON_DARK, PAGE
 
 #: Fields of a report that have a section of their own on the page.
@@ -71,6 +71,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         name: base64.b64encode(each).decode("ascii") if each else None
         for name, each in (("sheet", sheet), ("views", views))
     }
+    figure = draw_figure(report)
     return _ENVIRONMENT.get_template("report.html").render(
         report=report,
         scene=PurePath(report["scene"]["path"]).name,
@@ -81,8 +82,9 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         against=AGAINST,
         bins=BINS,
         round_length=round_length(report),
-        # All text in the figures is constant or escaped by the XML writer, so the SVGs are safe as markup.
-        figures=[(each, {name: Markup(each.svg[name]) for name in AGAINST}) for each in draw_figures(report)],
+        figure=figure,
+        # All text in the figure is constant or escaped by the XML writer, so the SVGs are safe as markup.
+        drawings={name: Markup(svg) for name, svg in figure.svg.items()} if figure else {},
         tables={name: table(report) for name, table in TABLES.items()},
         parts=_time_split(report),
         everything=_everything(report),

@@ -138,17 +138,16 @@ def test_sheet_is_embedded_unchanged() -> None:
     assert images_of(None) == []
 
 
-def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
+def test_loss_is_drawn_by_seconds_and_by_steps() -> None:
     page = sample_page()
-    figures = [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
-    assert figures == ["loss", "split"]
+    assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"] == ["loss"]
     assert "loss, relative to the unstylized scene" in {piece.strip() for piece in page.pieces}
     used = set(re.findall(r"var\(--c-([0-9a-f]{6}), #\1\)", page.html))
     defined = dict(re.findall(r"--c-([0-9a-f]{6}): (#[0-9a-f]{6});", page.html))
     assert used <= set(defined)
     assert defined == {printed[1:]: shown for printed, shown in ON_DARK.items()}
     for against in ("seconds", "steps"):
-        assert sum(label.endswith(f", against {against}") for label in page.drawings) == len(figures)
+        assert sum(label.endswith(f", against {against}") for label in page.drawings) == 1
         inputs = [attributes for tag, attributes in page.elements if tag == "input"]
         assert [i["id"] for i in inputs if i["type"] == "radio" and i["name"] == "against"] == [
             "against-seconds",
@@ -156,8 +155,8 @@ def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
         ]
         assert [i["id"] for i in inputs if "checked" in i] == ["against-seconds"]
         classes = [attributes.get("class") for tag, attributes in page.elements if tag == "div"]
-        assert classes.count(f"against-{against}") == len(figures)
-        assert f"#against-{against}:not(:checked) ~ .figures .against-{against} {{ display: none; }}" in page.html
+        assert classes.count(f"against-{against}") == 1
+        assert f"#against-{against}:not(:checked) ~ figure .against-{against} {{ display: none; }}" in page.html
 
 
 def test_hostile_names_are_escaped() -> None:
@@ -243,7 +242,7 @@ def test_reports_without_optional_parts_are_shown() -> None:
     for record in report["history"]:
         del record["parts"]
     page = parsed(report)
-    assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"] == ["loss", "split"]
+    assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"] == ["loss"]
     assert "No extreme values were found." in page.text
     assert "Loss over time" not in page.text
 
