@@ -174,7 +174,7 @@ class JudgedRegion:
         for camera in judge.cameras:
             images = [judge.renders(colors, camera)[0] for colors in (sh_dc, judge.scene.sh_dc)]
             fraction = self._maps.render(camera)[..., 0].double()
-            distance += float((self._lpips.distance(*images).map * fraction).sum())
+            distance += float((self._lpips.distance(*images) * fraction).sum())
             pixels += float(fraction.sum())
         assert pixels, "no judged view shows the region: choose another region, or more cameras"
         return distance / pixels

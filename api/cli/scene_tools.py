@@ -404,7 +404,7 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 
 def quality_table(quality: Quality) -> Table:
     """Return a table of the quality measures of each variant. A star marks variants on the Pareto front."""
-    figures = ("style", "interior style", "sliced features", "color distance", "content", "SSIM", "features")
+    figures = ("style", "interior style", "sliced features", "color distance", "content", "SSIM")
     ranges = [f"{reach} range {measure}" for reach in ("short", "long") for measure in ("RMSE", "LPIPS")]
     columns = (*figures, "background sensitivity", "saturated", *ranges, "remaining loss", "steps")
     table = Table(
@@ -420,7 +420,7 @@ def quality_table(quality: Quality) -> Table:
             outcome.name + (" *" if outcome in front else ""),
             *(_number(value) for value in (one.style, one.interior_style, one.sliced_features)),
             f"{one.color_distance:.0f}",
-            *(_number(value) for value in (one.content, one.ssim, one.features, one.background_sensitivity)),
+            *(_number(value) for value in (one.content, one.ssim, one.background_sensitivity)),
             f"{one.saturated:.1%}",
             *(_number(value) for value in drifts),
             _number(outcome.loss),

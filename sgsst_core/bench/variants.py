@@ -364,7 +364,7 @@ class VariantResult:
             "steps": self.steps,
             "seconds": self.seconds,
             **asdict(self.judgment),
-            "consistency": {name: pairs and pairs.as_dict() for name, pairs in ranges.items()},
+            "consistency": {name: pairs and asdict(pairs) for name, pairs in ranges.items()},
         }
 
 

@@ -49,7 +49,7 @@ from sgsst_core.stylizing.job import JobStyles
 #: bounds the cost of large views.
 JUDGED_SIDE = 1024
 #: Measures of each image.
-_MEASURES = ("style", "color_distance", "content", "ssim", "features", "interior_style", "sliced_features")
+_MEASURES = ("style", "color_distance", "content", "ssim", "interior_style", "sliced_features")
 #: Gray values of the backgrounds that each view is judged on: black and white.
 _BACKGROUNDS = (0.0, 1.0)
 #: Minimum coverage of judged views.
@@ -75,7 +75,6 @@ class Judgment:
             C_style)^1/2)); 0 if mean and covariance equal the style's.
         content: LPIPS (AlexNet) against the unstylized scene; 0 for identical images.
         ssim: SSIM of the luminance against the unstylized scene; 1 for identical images.
-        features: 1 - cosine between AlexNet's features of the stylized and the unstylized scene, averaged over layers.
         background_sensitivity: Absolute difference in `style` between black and white background, averaged over views.
         saturated: Fraction of the Gaussians with a color channel outside [0, 1].
         interior_style: `style` over features that see no background (see `Lpips.min_coverage`), averaged over layers
@@ -89,7 +88,6 @@ class Judgment:
     color_distance: float
     content: float
     ssim: float
-    features: float
     background_sensitivity: float
     saturated: float
     interior_style: float | None = None
@@ -167,7 +165,7 @@ class Judge:
         for level in _BACKGROUNDS:
             stylized, original = (self._on(values, coverage, camera, level) for values in (image, before))
             own, theirs = self._lpips.features(stylized), self._lpips.features(original)
-            distance = self._lpips.between(own, theirs, (camera.height, camera.width)).map
+            distance = self._lpips.between(own, theirs, (camera.height, camera.width))
             measures.append(
                 {
                     "style": sum(fraction * judge.distance(own, part) for judge, part, fraction in parts),
@@ -176,7 +174,6 @@ class Judge:
                     ),
                     "content": _weighted_mean(distance, weights),
                     "ssim": _weighted_mean(ssim(stylized, original).to(weights.device), weights),
-                    "features": fmean(_change_of_direction(x, y, weights) for x, y in zip(own, theirs, strict=True)),
                     **_interior(own, parts),
                 }
             )
@@ -346,15 +343,6 @@ def _quantiles(features: Tensor, weights: Tensor) -> Tensor:
     return ordered.gather(0, indices.clamp_max(len(ordered) - 1)).double()
 
 
-def _change_of_direction(x: Tensor, y: Tensor, coverage: Tensor) -> float:
-    """Return the weighted mean of 1 - cosine between the features [h, w, c] of two images.
-
-    Positions where both are zero count as unchanged.
-    """
-    differences = (_unit_features(x) - _unit_features(y)).square().sum(dim=2) / 2
-    return _weighted_mean(differences, _pooled(coverage, x))
-
-
 def _weighted_mean(values: Tensor, weights: Tensor) -> float:
     return float((values.double() * weights.double()).sum() / weights.sum(dtype=torch.float64))
 
@@ -394,20 +382,6 @@ MIN_SIDE = 31
 _LENGTH_EPS = 1e-10
 
 
-@dataclass(frozen=True)
-class PerceptualDistance:
-    """LPIPS of two images.
-
-    Attributes:
-        mean: LPIPS as published; 0 for equal images.
-        map: Distance per pixel [H, W]: each layer's distances upsampled bilinearly and summed over layers (published as
-            `spatial`). Its mean differs from `mean` only by the upsampling at the border.
-    """
-
-    mean: float
-    map: Tensor
-
-
 class PerceptualMetric(ABC):
     """LPIPS with one of the networks that its authors calibrated.
 
@@ -432,28 +406,25 @@ class PerceptualMetric(ABC):
         """
 
     @torch.no_grad()
-    def distance(self, first: Tensor, second: Tensor) -> PerceptualDistance:
-        """Compute the distance between two images [H, W, 3] of the same size, with values 0 to 1 in any floating dtype.
+    def distance(self, first: Tensor, second: Tensor) -> Tensor:
+        """Return the distance of two images [H, W, 3] of the same size, with values 0 to 1 in any floating dtype.
 
-        Raises:
-            ValueError: If the shapes differ or are not those of images, or a side is shorter than `MIN_SIDE`.
+        The sides of the images must be at least `MIN_SIDE`.
+
+        Returns:
+            Distance per pixel [H, W]: each layer's distances upsampled bilinearly and summed over layers (published as
+                `spatial`). Its mean is LPIPS as published, apart from the upsampling at the border; 0 for equal images.
         """
-        if first.shape != second.shape or first.ndim != 3 or first.shape[2] != 3:
-            raise ValueError(f"LPIPS of shapes {tuple(first.shape)} and {tuple(second.shape)}: two images [H, W, 3]")
-        size = (int(first.shape[0]), int(first.shape[1]))
-        if min(size) < MIN_SIDE:
-            raise ValueError(f"LPIPS of {size[1]} x {size[0]} pixels: {MIN_SIDE} are the least")
-        return self.between(self.features(first), self.features(second), size)
+        return self.between(self.features(first), self.features(second), (first.shape[0], first.shape[1]))
 
     @torch.no_grad()
-    def between(self, first: list[Tensor], second: list[Tensor], size: tuple[int, int]) -> PerceptualDistance:
-        """Compute the distance between two images of size (height, width) from their `features`."""
-        mean, spatial = 0.0, torch.zeros(size, dtype=self.dtype, device=self.device)
+    def between(self, first: list[Tensor], second: list[Tensor], size: tuple[int, int]) -> Tensor:
+        """Return the `distance` of two images of size (height, width) from their `features`."""
+        spatial = torch.zeros(size, dtype=self.dtype, device=self.device)
         for x, y, head in zip(first, second, self._heads, strict=True):
             distances = ((_unit_features(x) - _unit_features(y)).square_() @ head)[None, None]
-            mean += float(distances.mean(dtype=torch.float64))
             spatial += F.interpolate(distances, size=size, mode="bilinear", align_corners=False)[0, 0]
-        return PerceptualDistance(mean, spatial)
+        return spatial
 
 
 class Lpips(PerceptualMetric):
@@ -573,13 +544,9 @@ def shown(image: Tensor, camera: Camera, device: torch.device) -> Tensor:
     """Return an image [H, W, 3] of a view as a screen shows it: clamped to 0 to 1, on the given device.
 
     Raises:
-        ValueError: If the image does not have the camera's size, or contains NaN or infinity.
+        ValueError: If the image contains NaN or infinity.
     """
     image = image.detach().to(device)
-    if tuple(image.shape) != (camera.height, camera.width, 3):
-        raise ValueError(
-            f"image of view {camera.name!r}: shape {tuple(image.shape)}, not {(camera.height, camera.width, 3)}"
-        )
     if not bool(image.isfinite().all()):
         raise ValueError(f"image of view {camera.name!r}: holds NaN or infinity")
     return image.clamp(0, 1).contiguous()

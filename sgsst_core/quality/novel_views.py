@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -62,7 +62,7 @@ class NovelViewMoment:
             "seconds": seconds,
             "gram": {str(scale): value for scale, value in self.gram.items()},
             "gram_relative": self.gram_relative,
-            "consistency": {name: pairs and pairs.as_dict() for name, pairs in ranges.items()},
+            "consistency": {name: pairs and asdict(pairs) for name, pairs in ranges.items()},
         }
 
 
@@ -214,49 +214,21 @@ _GAUSSIANS = 1 << 18
 
 
 @dataclass(frozen=True)
-class PairConsistency:
-    """Consistency of one pair of views.
+class Consistency:
+    """Consistency of pairs of views `gap` apart. Means skip pairs without a value.
 
     Attributes:
-        first, second: Indices of the views; the second is warped into the first.
-        compared: Fraction of the first view's pixels that could be compared.
-        rmse: Root mean square difference of the colors (0 to 1) over those pixels; None if there are too few.
-        lpips: LPIPS averaged over those pixels; None if there are too few, the view is too small, or LPIPS is off.
+        pairs: Number of pairs.
+        compared: Mean fraction of the first view's pixels that could be compared with the second one's.
+        rmse: Mean root mean square difference of the colors (0 to 1) over those pixels; None if no pair has a value.
+        lpips: Mean LPIPS, averaged over those pixels; None if no pair has a value.
     """
 
-    first: int
-    second: int
+    gap: int
+    pairs: int
     compared: float
     rmse: float | None
     lpips: float | None
-
-
-@dataclass(frozen=True)
-class Consistency:
-    """Consistency of all pairs of views `gap` apart, ordered by first view. Means skip pairs without a value."""
-
-    gap: int
-    pairs: list[PairConsistency]
-
-    @property
-    def rmse(self) -> float | None:
-        """Mean RMSE, or None if no pair could be compared."""
-        return _mean([pair.rmse for pair in self.pairs])
-
-    @property
-    def lpips(self) -> float | None:
-        """Mean LPIPS, or None if no pair has an LPIPS value."""
-        return _mean([pair.lpips for pair in self.pairs])
-
-    @property
-    def compared(self) -> float:
-        """Mean fraction of pixels that could be compared, over all pairs; 0 if there are no pairs."""
-        return _mean([pair.compared for pair in self.pairs]) or 0.0
-
-    def as_dict(self) -> dict[str, float | None]:
-        """Return the means as JSON-serializable values."""
-        means = {name: getattr(self, name) for name in ("compared", "rmse", "lpips")}
-        return {"gap": self.gap, "pairs": len(self.pairs), **means}
 
 
 @dataclass(frozen=True)
@@ -280,7 +252,7 @@ def consistency(
     warp: Callable[[int, int], Warp],
     lpips: PerceptualMetric | None = None,
 ) -> Consistency:
-    """Compute the consistency of pairs of views `gap` apart.
+    """Compute the consistency of at least one pair of views `gap` apart.
 
     Args:
         image: Function that returns the image [H, W, 3] of a view as a screen shows it (`shown`).
@@ -290,8 +262,9 @@ def consistency(
     results = []
     for first, second in pairs:
         warped, valid = warp(first, second).apply(image(second))
-        results.append(compare(first, second, image(first), warped, valid, lpips))
-    return Consistency(gap, results)
+        results.append(compare(image(first), warped, valid, lpips))
+    compared, rmse, distances = zip(*results, strict=True)
+    return Consistency(gap, len(results), sum(compared) / len(results), _mean(rmse), _mean(distances))
 
 
 def view_pairs(count: int, gap: int, at_most: int | None = None) -> list[tuple[int, int]]:
@@ -443,21 +416,26 @@ def _around(
 
 
 def compare(
-    first: int, second: int, image: Tensor, warped: Tensor, valid: Tensor, lpips: PerceptualMetric | None
-) -> PairConsistency:
-    """Compare a view's image [H, W, 3] with another view's warped image, where the mask `valid` [H, W] is true."""
+    image: Tensor, warped: Tensor, valid: Tensor, lpips: PerceptualMetric | None
+) -> tuple[float, float | None, float | None]:
+    """Compare a view's image [H, W, 3] with another view's warped image, where the mask `valid` [H, W] is true.
+
+    Returns:
+        Fraction of the pixels that could be compared; their RMSE, None if there are too few; and their mean LPIPS, None
+            if there are too few, the view is too small, or LPIPS is off.
+    """
     count = int(valid.sum())
     compared = count / valid.numel()
     if count == 0 or compared < MINIMUM_COMPARED:
-        return PairConsistency(first, second, compared, None, None)
+        return compared, None, None
     rmse = float((image[valid].double() - warped[valid].double()).square().mean().sqrt())
     distance = None
     if lpips is not None and min(valid.shape) >= MIN_SIDE:
         # Fill invalid pixels with the view's own image: holes would add edges to the features of valid pixels.
         filled = torch.where(valid[..., None], warped, image)
-        distances = lpips.distance(image, filled).map
+        distances = lpips.distance(image, filled)
         distance = float(distances[valid.to(distances.device)].mean(dtype=torch.float64))
-    return PairConsistency(first, second, compared, rmse, distance)
+    return compared, rmse, distance
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -28,7 +28,7 @@ from sgsst_core.stylizing.steps import Evaluation, StepRecord, mean_loss, on_sca
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Version of report.json, raised whenever a field is removed or changes its meaning.
-REPORT_VERSION = 3
+REPORT_VERSION = 4
 #: Version of plan.json.
 PLAN_VERSION = 3
 

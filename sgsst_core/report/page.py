@@ -197,7 +197,6 @@ _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
     "color_distance": ("distance to its colors, in 8-bit levels", number),
     "content": ("content loss (LPIPS)", number),
     "ssim": ("SSIM against the unstylized scene", number),
-    "features": ("feature distance (1 - cosine)", number),
     "background_sensitivity": ("background sensitivity: style on black against white", number),
     "saturated": ("colors outside the displayable range", percent),
 }

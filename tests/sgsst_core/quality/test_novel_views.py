@@ -17,7 +17,6 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import GRAM_WEIGHT
 from sgsst_core.quality.judge import Lpips, PerceptualMetric, VggLpips, shown
 from sgsst_core.quality.novel_views import (
-    LONG_RANGE,
     SHORT_RANGE,
     Consistency,
     DepthMap,
@@ -465,13 +464,12 @@ def test_pairs_without_overlap_have_no_value(lpips):
     other_side = camera((0, 0, 3 * DEPTH))  # sees the plane from behind, which is the same surface
     cameras = [camera((0, 0, 0)), behind, behind, other_side, camera((0.1, 0, 3 * DEPTH))]
     result = measure(scene, cameras, lpips=lpips)
-    assert [pair.rmse is None for pair in result.pairs] == [True, True, True, False]
-    assert ([pair.compared for pair in result.pairs[:3]], result.rmse) == ([0, 0, 0], result.pairs[3].rmse)
-    assert result.lpips == result.pairs[3].lpips
+    last = measure(scene, cameras[3:], lpips=lpips)
+    assert last.rmse is not None
+    assert (result.pairs, result.rmse, result.lpips) == (4, last.rmse, last.lpips)
+    assert result.compared == pytest.approx(last.compared / 4)
     nothing = measure(scene, cameras[:2], lpips=lpips)
     assert (nothing.rmse, nothing.lpips, nothing.compared) == (None, None, 0.0)
-    alone = measure(scene, cameras[:1], gap=LONG_RANGE)
-    assert (alone.pairs, alone.rmse, alone.compared) == ([], None, 0.0)
 
 
 def test_distance_from_the_origin_does_not_change_values():

@@ -13,7 +13,7 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
     before = {str(scale): _terms(1e6 / 4**scale) for scale in range(scales)}
     after = {str(scale): _terms(1e5 / 4**scale) for scale in range(scales)}
     return {
-        "version": 3,
+        "version": 4,
         "program": {"name": "sgsst-service", "version": "0.1.0"},
         "created": "2026-01-02T03:04:05+00:00",
         "stopped": "finished",
@@ -129,7 +129,7 @@ def _moment(step: int, history: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _judged(style: float, content: float) -> dict[str, float]:
-    judged = {"style": style, "color_distance": 40 * style, "content": content, "features": content / 2}
+    judged = {"style": style, "color_distance": 40 * style, "content": content}
     judged["ssim"] = 1 - content
     interior = {"interior_style": style / 2, "sliced_features": style / 4}
     return {**judged, **interior, "background_sensitivity": 0.25, "saturated": 0.02}
