@@ -7,8 +7,7 @@ the blend weights and T_final is the final transmittance. The gradient with resp
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from contextlib import AbstractContextManager, nullcontext
-from typing import Any, ClassVar, Generic, Literal, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,6 +17,9 @@ from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+
+if TYPE_CHECKING:
+    from sgsst_core.rasterizer.triton import CountedPieces
 
 Color = tuple[float, float, float]
 #: Precision of cached blend weights. `half` stores weights times a power of two as float16, with a relative error of at
@@ -34,36 +36,6 @@ def camera_key(camera: Camera) -> CameraKey:
     pose = camera.world_to_camera.detach().cpu().double().contiguous().numpy().tobytes()
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.slope_limits)
     return camera.width, camera.height, intrinsics, pose
-
-
-class CachedWeights(Protocol):
-    """Cached blend weights of a view, on the device where they are applied.
-
-    Attributes:
-        transmittance: [h, w] float32, final transmittance.
-    """
-
-    transmittance: Tensor
-
-    @property
-    def nbytes(self) -> int:
-        """Size on the device in bytes."""
-
-    def render(self, colors: Tensor) -> Tensor:
-        """Return the float32 image [h, w, 3] of colors [N, 3] over the background."""
-
-    def color_gradient(self, image_gradient: Tensor) -> Tensor:
-        """Return W^T dL/dimage, [N, 3] float32, given the image gradient [h, w, 3]."""
-
-
-class CountedWeights(Protocol):
-    """Blend weights of a view, counted but not stored."""
-
-    def nbytes(self, precision: Precision) -> int:
-        """Return the size that the weights would have in bytes."""
-
-    def store(self, precision: Precision) -> CachedWeights:
-        """Compute the weights again and store them."""
 
 
 class Rasterizer(ABC):
@@ -188,7 +160,7 @@ class Rasterizer(ABC):
         """Rasterizer whose images are bit-identical whether or not weights are cached."""
         return self
 
-    def count_weights(self, camera: Camera) -> CountedWeights:
+    def count_weights(self, camera: Camera) -> CountedPieces:
         """Count a view's weights without storing them; takes about as long as one render.
 
         Raises:
@@ -199,10 +171,6 @@ class Rasterizer(ABC):
     def cache_weights(self, camera: Camera) -> bool:
         """Cache a view's weights if possible, and return whether they are cached."""
         return False
-
-    def temporary_weights(self, camera: Camera) -> AbstractContextManager[None]:
-        """Use cached weights for a view inside a `with` block if this rasterizer caches any."""
-        return nullcontext()
 
     def release_view(self, camera: Camera, budget: int) -> None:
         """Drop the prepared data of a view whose weights are now cached; limit that of all others to `budget` bytes.

@@ -20,8 +20,7 @@ reduced to reading W from memory. Weights are stored on the device that applies 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,15 +31,7 @@ from sgsst_core.budget import Cache
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, LOG2_ALPHA_MIN, TO_POWER_OF_TWO, TRANSMITTANCE_MIN
 from sgsst_core.devices import on_device
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.base import (
-    CachedWeights,
-    CameraKey,
-    CountedWeights,
-    Precision,
-    Rasterizer,
-    TiledRasterizer,
-    camera_key,
-)
+from sgsst_core.rasterizer.base import CameraKey, Precision, Rasterizer, TiledRasterizer, camera_key
 from sgsst_core.rasterizer.projection import check_intersections, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -127,7 +118,7 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
             )
         return chosen
 
-    def count_weights(self, camera: Camera) -> CountedWeights:
+    def count_weights(self, camera: Camera) -> CountedPieces:
         """Count a view's weights without storing them; takes about as long as one render."""
         return CountedPieces(self, camera)
 
@@ -472,8 +463,7 @@ class CachedRasterizer(Rasterizer):
         self.max_bytes = max_bytes
         self.min_intersection_bytes = min_intersection_bytes
         self._at_first_use = at_first_use
-        self._cached: Cache[CameraKey, CachedWeights] = Cache(max_bytes)
-        self._temporary: dict[CameraKey, CachedWeights] = {}
+        self._cached: Cache[CameraKey, WeightPieces] = Cache(max_bytes)
         self._lock = threading.Lock()
 
     @classmethod
@@ -496,7 +486,7 @@ class CachedRasterizer(Rasterizer):
         """Rasterizer whose images are bit-identical whether or not weights are cached."""
         return self.uncached
 
-    def count_weights(self, camera: Camera) -> CountedWeights:
+    def count_weights(self, camera: Camera) -> CountedPieces:
         """Count a view's weights without storing them; takes about as long as one render."""
         return self.uncached.count_weights(camera)
 
@@ -507,9 +497,9 @@ class CachedRasterizer(Rasterizer):
         """
         key = camera_key(camera)
         with self._lock:
-            if self._serving(key) is None:
+            if key not in self._cached:
                 self._cached.add(key, lambda: self._counted(camera))
-            return self._serving(key) is not None
+            return key in self._cached
 
     @property
     def caches(self) -> dict[str, Cache[CameraKey, Any]]:
@@ -524,22 +514,6 @@ class CachedRasterizer(Rasterizer):
         """Drop the weights and the tile intersections of all views."""
         self._cached.clear()
         self.uncached.forget_views()
-
-    @contextmanager
-    def temporary_weights(self, camera: Camera) -> Iterator[None]:
-        """Use temporary cached weights for a view inside a `with` block.
-
-        If the view already has cached weights, those are used. If the weights alone would exceed `max_bytes`, they are
-        not computed, and the view is rendered without them.
-        """
-        key = camera_key(camera)
-        counted = None if self._serving(key) else self.count_weights(camera)
-        if counted is not None and (self.max_bytes is None or counted.nbytes(self.precision) <= self.max_bytes):
-            self._temporary[key] = counted.store(self.precision)
-        try:
-            yield
-        finally:
-            self._temporary.pop(key, None)
 
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [h, w], and each Gaussian's blend weight summed over all pixels [N].
@@ -562,21 +536,17 @@ class CachedRasterizer(Rasterizer):
             return self.uncached.color_gradient(image_gradient, camera)
         return cached.color_gradient(image_gradient)
 
-    def _cached_for(self, camera: Camera) -> CachedWeights | None:
+    def _cached_for(self, camera: Camera) -> WeightPieces | None:
         """Return the cached weights for a view, or None. With `at_first_use` they are computed first, if they fit."""
         if self._at_first_use:
             self.cache_weights(camera)
-        return self._serving(camera_key(camera))
+        return self._cached.values.get(camera_key(camera))
 
-    def _serving(self, key: CameraKey) -> CachedWeights | None:
-        """Return the cached or temporary weights of a view; None if there are none."""
-        return self._cached.values.get(key) or self._temporary.get(key)
-
-    def _counted(self, camera: Camera) -> tuple[int, Callable[[], CachedWeights]]:
+    def _counted(self, camera: Camera) -> tuple[int, Callable[[], WeightPieces]]:
         """Return the size in bytes of a view's weights, and a function that computes them."""
         counted = self.count_weights(camera)
 
-        def make() -> CachedWeights:
+        def make() -> WeightPieces:
             weights = counted.store(self.precision)
             budget = self.intersection_budget(self.cached_bytes + weights.nbytes)
             if budget is not None:

@@ -675,17 +675,16 @@ class Stylizer:
     def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
         """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its time in seconds.
 
-        Targets are prepared before timing starts. This does not affect steps.
+        Targets are prepared before timing starts. This does not affect steps, and caches no blend weights.
         """
         self._cache_visited()
         target, style = (
             self.job.view_targets.target(index, scales),
             self.job.style_targets(self.job.views.cameras[index]),
         )
-        with self.job.views.temporary_weights(index):
-            started = time.perf_counter()
-            gradient = self.job.gradient(index, self.sh_dc.detach(), style, target, scales)[0]
-            return gradient.cpu(), time.perf_counter() - started
+        started = time.perf_counter()
+        gradient = self.job.gradient(index, self.sh_dc.detach(), style, target, scales)[0].cpu()
+        return gradient, time.perf_counter() - started
 
     def _cache_visited(self) -> None:
         """Cache, once after a resume, the blend weights that previous steps cached.

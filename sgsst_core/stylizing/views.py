@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -183,11 +182,6 @@ class Views:
         camera = self._own_camera(index)
         if camera is not None:
             self.rasterizer.cache_weights(camera)
-
-    def temporary_weights(self, index: int) -> AbstractContextManager[None]:
-        """Use in a `with` block the blend weights that `cache_weights` would cache, even if they are not cached."""
-        camera = self._own_camera(index)
-        return nullcontext() if camera is None else self.rasterizer.temporary_weights(camera)
 
     def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
         """Return the sum [N, 3] of all ranks' gradients, which are 0 for all Gaussians but those in `shown`."""
