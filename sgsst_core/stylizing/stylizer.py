@@ -242,12 +242,9 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     if job.settings.unseen != "neighbors":
         return colors
     weights = torch.where(job.plan.optimized, job.plan.survey.total_blend_weights, 0.0)
-    change, regions = colors - job.scene.sh_dc, job.regions
-    unseen = weights <= 0 if regions is None else (weights <= 0) & ~regions.frozen
-    if regions is None:
-        change = neighbors_change(job.scene.means, change, weights)
-    else:
-        change = neighbors_change_by_region(job.scene.means, change, weights, regions)[unseen]
+    free = torch.ones_like(job.plan.seen) if job.regions is None else ~job.regions.frozen
+    unseen = (weights <= 0) & free
+    change = neighbors_change(job.scene.means[free], (colors - job.scene.sh_dc)[free], weights[free])
     change = change.mean(dim=1, keepdim=True) if job.preserves_chroma else change
     original = job.scene.sh_dc[unseen]
     chroma_of = original if job.preserves_chroma else None
@@ -288,26 +285,6 @@ def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
         sums = (change[nearest].double() * fraction[:, :, None]).sum(dim=1)
         votes[part] = (sums / fraction.sum(dim=1, keepdim=True)).float()
     return votes
-
-
-def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, regions: Regions) -> Tensor:
-    """Return color changes for the Gaussians that are not optimized: those of their neighbors in the same region.
-
-    If a region has no optimized Gaussians, neighbors in all regions count. The change of frozen Gaussians is 0.
-
-    Arguments are as in `neighbors_change`, but all weights other than those of optimized Gaussians are 0. The result is
-    [N, 3].
-    """
-    result = torch.zeros_like(change)
-    for region in regions.labels[~regions.frozen].unique().tolist():
-        members = regions.members(region)
-        voters = torch.where(members, weights, 0.0)
-        if not bool((voters > 0).any()):
-            voters = weights
-        rows = members | (voters > 0)
-        takes = rows & (voters <= 0)
-        result[takes] = neighbors_change(means[rows], change[rows], voters[rows])
-    return result
 
 
 def render_first_view(

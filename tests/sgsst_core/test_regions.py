@@ -44,7 +44,7 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, fingerprint, load_checkpoint, versions
 from sgsst_core.stylizing.job import JobInputs, check_style_size, prepare_job, prepared_style, rotated
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.stylizer import Stylizer, neighbors_change_by_region
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import LFS_POINTER, ball, cameras, style, wall, write_files
 
@@ -456,19 +456,6 @@ def test_each_region_approaches_its_own_style(tiny_weights: BackboneWeights) -> 
 
 
 # --- resuming, reference and plan ----------------------------------------------------------------------------------
-
-
-def test_unseen_gaussians_follow_their_own_region() -> None:
-    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.9, 0, 0], [0.1, 0, 0], [5, 0, 0]])
-    change = torch.tensor([[1.0] * 3, [2.0] * 3, [0.0] * 3, [0.0] * 3, [0.0] * 3])
-    weights = torch.tensor([1.0, 1, 0, 0, 0]).double()
-    labels = torch.tensor([0, 1, 0, 1, 2], dtype=torch.uint8)
-    regions = Regions((Region("rest"), Region("a"), Region("b", freeze=True)), labels)
-    result = neighbors_change_by_region(means, change, weights, regions)
-    assert result[2:, 0].tolist() == [1.0, 2.0, 0.0]
-    without = replace(regions, labels=torch.tensor([0, 0, 1, 0, 2], dtype=torch.uint8))
-    result = neighbors_change_by_region(means, change, weights, without)
-    assert result[2, 0] == 1.5  # nothing in its region is optimized
 
 
 def test_resumed_job_is_bit_identical(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
