@@ -147,33 +147,6 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
         add_slots_(gradient, slots, isects.first_slots, isects.gaussians)
         return gradient
 
-    def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
-        """Return coverage [h, w], and each Gaussian's blend weight summed over all pixels [N], in one pass.
-
-        Bit-identical to `coverage`, and to a column of `color_gradient` for an image gradient of ones.
-        """
-        from sgsst_core.rasterizer import triton_kernels as kernels
-
-        isects = self.intersections(camera)
-        weights = torch.zeros(len(self.scene), device=self.device)
-        slots = torch.zeros(len(isects.ranks), device=self.device)
-        transmittance = torch.empty((camera.height, camera.width), device=self.device)
-        across, tiles = tiles_of(camera)
-        with on_device(self.device):
-            kernels.survey[(tiles,)](
-                isects.ranks, isects.slots, isects.starts, isects.values, slots, transmittance,
-                camera.width, camera.height, across,
-                **self.cuts(kernels.SUMMING_WARPS),
-            )  # fmt: skip
-        visible, block = len(isects.gaussians), kernels.ADDED.value
-        if visible:
-            with on_device(self.device):
-                kernels.add_slot_weights[(-(-visible // block),)](
-                    slots, isects.first_slots, isects.gaussians, weights, visible,
-                    BLOCK=block, SLOTS=kernels.SLOTS.value,
-                )  # fmt: skip
-        return 1 - transmittance, weights
-
     def _blend(self, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return the image and the final transmittance of a view."""
         from sgsst_core.rasterizer import triton_kernels as kernels

@@ -395,51 +395,6 @@ def add_slots(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr, 
     tl.store(row + 2, tl.sum(blue, 1).to(tl.float32), mask=there)
 
 
-@triton.jit
-def survey(
-    ranks, slots, starts, values, out, transmittances, width, height, across,
-    ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr,
-):  # fmt: skip
-    """Compute the final transmittance [h, width] of a whole view, and the sum of weights of each pair in its slot [E].
-
-    Slots must be zero on entry. The results equal those of `render`, and of `slot_gradients` for an image gradient of
-    ones, but take only one pass. There is one program per raster tile.
-    """
-    tile = tl.program_id(0)
-    x, y, pixel, inside = tile_pixels(tile, across, width, height)
-    left = tl.where(inside, 1.0, 0.0)
-    final = left
-    pair = tl.arange(0, PAIRS)
-    k, end = tl.load(starts + tile), tl.load(starts + tile + 1)
-    while (k < end) & (tl.max(left) > 0):
-        there = k + pair < end
-        pairs = load_pairs(ranks, values, k + pair, there, tile, across)
-        sums = tl.zeros([PAIRS], tl.float32)
-        for i in range(tl.minimum(end - k, PAIRS).to(tl.int32)):
-            lane = tl.full([PAIRS], i, tl.int32)
-            weight, left, final = blend(pairs, lane, x, y, left, final, ALPHA_MAX, ALPHA_MIN, STOP)
-            sums = tl.where(pair == lane, tl.sum(weight), sums)
-        tl.store(out + tl.load(slots + k + pair, mask=there, other=0).to(tl.int64), sums, mask=there)
-        k += PAIRS
-    tl.store(transmittances + pixel, final, mask=inside)
-
-
-@triton.jit
-def add_slot_weights(slots, first_slots, gaussians, out, visible, BLOCK: tl.constexpr, SLOTS: tl.constexpr):
-    """Sum each Gaussian's slots [E] into `out` [N], as `add_slots` does."""
-    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    there = rank < visible
-    slot = tl.load(first_slots + rank, mask=there, other=0).to(tl.int64)
-    end = tl.load(first_slots + rank + 1, mask=there, other=0).to(tl.int64)
-    total = tl.zeros([BLOCK, SLOTS], tl.float64)
-    while tl.max(end - slot, 0) > 0:
-        j = slot[:, None] + tl.arange(0, SLOTS)[None, :]
-        total += tl.load(slots + j, mask=j < end[:, None], other=0.0).to(tl.float64)
-        slot += SLOTS
-    gaussian = tl.load(gaussians + rank, mask=there, other=0).to(tl.int64)
-    tl.store(out + gaussian, tl.sum(total, 1).to(tl.float32), mask=there)
-
-
 #: Blocks per raster tile, weights per piece, and pieces that a program reads per step.
 BLOCKS, PIECE, PIECES = tl.constexpr(16), tl.constexpr(16), tl.constexpr(16)
 #: Factor of weights stored in float16. Products with the largest weight (0.99) are in the range of float16, and those

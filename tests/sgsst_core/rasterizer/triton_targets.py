@@ -175,8 +175,6 @@ KERNELS: dict[str, Target] = {
         for kernel in (feature_kernels.max_pool, feature_kernels.max_pool_backward)
         for form, integers, types in (("float32", torch.int32, "*i32"), ("bfloat16", torch.int16, "*i16"))
     },
-    "survey": Target(kernels.survey, _CUTS, kernels.SUMMING_WARPS, {"height": "i32"}),
-    "add_slot_weights": Target(kernels.add_slot_weights, _ADDED, 4, {"slots": "*fp32"}),
     "count_pieces": Target(kernels.count_pieces, _CUTS, kernels.SUMMING_WARPS),
     **_of_cached_weights("float32"),
     **_of_cached_weights("half"),
