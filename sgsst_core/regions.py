@@ -41,9 +41,6 @@ from sgsst_core.refine import Refinement, parents_of
 from sgsst_core.scene.camera import Camera
 from sgsst_core.style import Style
 
-#: Number of region maps that are computed by one render, and bytes per pixel of a map at all scales.
-_MAPS_PER_RENDER, _MAP_BYTES = 3, 16 / 3
-
 
 @dataclass(frozen=True)
 class Region:
@@ -180,13 +177,12 @@ def check_regions(regions: Regions, sh_attenuation: float = 0.0, content_weight:
         raise SettingsError(f"Every Gaussian is frozen ({names}): nothing would change. Freeze fewer regions.")
 
 
-def region_decisions(regions: Regions, weights: Tensor, cameras: Sequence[Camera]) -> list[Decision]:
-    """Return the decisions about the regions as requested, and the cost of their maps.
+def region_decisions(regions: Regions, weights: Tensor) -> list[Decision]:
+    """Return the decisions about the regions as requested.
 
     Args:
         regions: Regions as requested, which have been `resolved` without an error.
         weights: [N] float64, blend weight of each Gaussian, summed over all views.
-        cameras: Cameras of all views that are stylized.
     """
     resolved, lines = regions.resolved(weights), []
     for index, region in enumerate(regions.every):
@@ -213,12 +209,9 @@ def region_decisions(regions: Regions, weights: Tensor, cameras: Sequence[Camera
         lines.append(Decision(f"region {region.name}", decision, reason, error=ANOTHER_LOSS))
     if resolved.mapped:
         count = len(resolved.active)
-        pixels = sum(camera.width * camera.height for camera in cameras)
-        renders = 1 + -(-count // _MAPS_PER_RENDER)  # plus one for the background
         decision = (
             f"statistics of {count} region{'' if count == 1 else 's'} are weighted by each region's fraction of a "
-            f"pixel's blend weights; {renders} renders at a view's first visit, "
-            f"{int(_MAP_BYTES * count * pixels) / 1e6:.1f} MB for all views"
+            "pixel's blend weights"
         )
         lines.append(
             Decision("regions", decision, "otherwise styles would leak into other regions", error=ANOTHER_LOSS)

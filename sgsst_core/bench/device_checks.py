@@ -10,7 +10,6 @@ import importlib.metadata
 import math
 import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -46,8 +45,6 @@ from sgsst_core.stylizing.loop import stylize
 #: each point, as in scans.
 _OVERLAP = 1.0
 _CHANNELS = (64, 128, 256, 512, 512)
-#: Seconds after which a query of `nvidia-smi` counts as failed.
-_TIMEOUT = 10
 #: Gigabytes of memory budget below which only small scenes fit.
 _LITTLE_MEMORY = 2.0
 #: Background of all renders.
@@ -120,9 +117,7 @@ def _gpu() -> Diagnosis:
         device = torch.device("cuda", torch.cuda.current_device())
         capability = ".".join(map(str, torch.cuda.get_device_capability(device)))
         name, library = torch.cuda.get_device_name(device), torch.version.cuda or torch.version.hip
-        text = (
-            f"{torch.cuda.device_count()} x {name}, compute capability {capability}, CUDA {library}, driver {_driver()}"
-        )
+        text = f"{torch.cuda.device_count()} x {name}, compute capability {capability}, CUDA {library}"
         return Diagnosis("GPU", "works", text)
     devices = ("/dev/nvidia0", "/proc/driver/nvidia/version", "/dev/kfd")
     if not any(Path(path).exists() for path in devices) and shutil.which("nvidia-smi") is None:
@@ -135,16 +130,6 @@ def _gpu() -> Diagnosis:
     except Exception as error:  # whatever the exception, it says why
         return Diagnosis("GPU", "warning", f"PyTorch cannot use it: {str(error).splitlines()[0]} Update its driver.")
     return Diagnosis("GPU", "warning", "PyTorch sees none. Check CUDA_VISIBLE_DEVICES and the driver.")
-
-
-def _driver() -> str:
-    """Return the version of the NVIDIA driver; "unknown" if `nvidia-smi` is missing, fails or takes too long."""
-    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT)
-    except (OSError, subprocess.TimeoutExpired):
-        return "unknown"
-    return done.stdout.split("\n")[0].strip() if done.returncode == 0 else "unknown"
 
 
 def _memory(device: torch.device) -> Diagnosis:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save, save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from sgsst_core.errors import CheckpointError
@@ -84,7 +84,7 @@ class Checkpoints:
             OutputError: If the file cannot be written; the newest existing checkpoint remains.
         """
         with atomic_path(self.latest) as temporary:
-            _write(temporary, checkpoint, job)
+            temporary.write_bytes(save(*_packed(checkpoint, job, checkpoint.run)))
             if self.latest.exists():
                 self.latest.replace(self.previous)
 
@@ -183,24 +183,13 @@ def _add_regions(digest: Any, regions: Regions) -> None:
             digest.update(repr(tuple(image.shape)).encode() + image.contiguous().numpy().tobytes())
 
 
-def _write(path: Path, checkpoint: Checkpoint, job: str) -> None:
-    tensors, metadata = _packed(checkpoint, job, checkpoint.run)
-    try:
-        save_file(tensors, path, metadata)
-    except SafetensorError as error:  # the operating system's error is contained only in the text
-        if "os error" not in str(error).lower():
-            raise
-        digits = str(error).lower().rpartition("os error")[2].strip(" )")  # "No space left on device (os error 28)"
-        raise OSError(int(digits) if digits.isdigit() else 0, str(error)) from error
-
-
 def save_plan(path: Path, plan: Plan, job: str, conditions: str) -> None:
     """Write a plan into an existing file, for a run of the same job that finds the same conditions.
 
     Args:
         conditions: Text about everything else that the plan depends on, such as the machine.
     """
-    path.write_bytes(save(*_packed(plan, job, conditions)))  # `save_file` replaces the file
+    path.write_bytes(save(*_packed(plan, job, conditions)))
 
 
 def load_plan(path: Path, job: str, scene: Scene, cameras: Sequence[Camera]) -> tuple[Plan, str]:

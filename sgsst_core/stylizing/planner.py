@@ -186,7 +186,7 @@ def _about_inputs(
         yield from orbit_decisions(inputs.orbit, len(fitted))
     style, regions = inputs.style, inputs.regions
     if regions is not None:
-        yield from region_decisions(regions, survey.total_blend_weights, [fitted[index] for index in survey.covered])
+        yield from region_decisions(regions, survey.total_blend_weights)
     own = [region.style for region in regions.every if region.style] if regions else []
     for each in (style, *own):
         yield from (Decision("style", "warning", note) for note in each.notes)
