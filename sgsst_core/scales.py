@@ -82,12 +82,6 @@ class ScaleWeights:
         coarsest_first = reversed(self.chosen(count))
         return sum(4.0**-scale * float(period) ** -place for place, scale in enumerate(coarsest_first))
 
-    def sampled_cost(self, count: int, period: int) -> float:
-        """Return the cost of all scales but the coarsest in a mean step, relative to a step with all scales."""
-        *finer, coarsest = self.chosen(count)
-        always = 4.0**-coarsest
-        return (self.evaluated(count, period) - always) / (self.evaluated(count) - always) if finer else 1.0
-
     def mean(self, losses: Mapping[int, float]) -> float:
         """Return E, the weighted mean of losses by scale. Every scale in `losses` must have a positive weight."""
         total = sum(self.of(scale) for scale in losses)
