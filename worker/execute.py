@@ -22,7 +22,7 @@ from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import CompressionLoss, Measurements, measure_compression
 from sgsst_core.report.document import build_report, loss_over_time, plan_json, seconds_json, sent_json
 from sgsst_core.report.images import write_contact_sheet, write_views
-from sgsst_core.stylizing.checkpoint import Checkpoint, versions
+from sgsst_core.stylizing.checkpoint import Checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.loop import Callbacks, Stopped, run
 from sgsst_core.stylizing.planner import estimate
 from sgsst_core.stylizing.steps import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
@@ -160,7 +160,7 @@ class _CheckpointWriter:
         self.error = None
         checkpoint = Checkpoint(stylizer.state(), stylizer.job.plan, job.planned_ranks, self._run_id, versions())
         try:
-            job.outputs.checkpoints.save(checkpoint, job.fingerprint)
+            save_checkpoint(job.outputs.checkpoint, checkpoint, job.fingerprint)
             self._listener.saved(stylizer.step)
         except OutputError as error:
             self.error = error
@@ -185,7 +185,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
     )
     compressed = stylizer.job.collectives.broadcast(lambda: _write_compressed(job))
     if first and stopped not in CONTINUABLE:
-        outputs.checkpoints.remove()
+        outputs.checkpoint.unlink(missing_ok=True)
     if stylizer.job.collectives.broadcast(lambda: stopped != "on-request" and (left is None or left() > 0)):
         measure.at_the_end()
     # The initial loss is evaluated here, because evaluating it before the first step would delay the job.

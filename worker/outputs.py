@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import ensure_writable_folder
@@ -14,9 +13,6 @@ from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.formats.sog import STREAMED_SOG
 from worker.job import JobSpec, check_choice, check_steps
-
-if TYPE_CHECKING:
-    from sgsst_core.stylizing.checkpoint import Checkpoints
 
 
 def result_format(out: Path) -> SceneFormat:
@@ -126,16 +122,9 @@ class Outputs:
 
     @property
     def all(self) -> list[Path]:
-        """Return the paths of all output files except the older checkpoint, which is only created by renaming."""
+        """Return the paths of all output files."""
         paths = [self.ply, *(getattr(self, name) for name in _SUFFIXES)]
         return paths if self.compressed is None else [*paths, self.compressed]
-
-    @property
-    def checkpoints(self) -> Checkpoints:
-        """Return the checkpoints from which an unfinished job can resume."""
-        from sgsst_core.stylizing.checkpoint import Checkpoints
-
-        return Checkpoints(self.checkpoint)
 
 
 def check_request(request: JobSpec) -> Outputs:

@@ -37,7 +37,7 @@ from sgsst_core.report.document import Sources
 from sgsst_core.scene.camera import resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
-from sgsst_core.stylizing.checkpoint import Checkpoint, load_plan, save_plan, versions
+from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, load_plan, save_plan, versions
 from sgsst_core.stylizing.job import JobInputs, StylizationJob
 from sgsst_core.stylizing.planner import choose_within, plan_job
 from sgsst_core.stylizing.refining import refine
@@ -261,14 +261,13 @@ def _find_checkpoint(outputs: Outputs, job_id: str, resume: Resume, warn: Warn) 
     """Return the checkpoint to resume from; None to start from the beginning."""
     if not resume.wanted:
         return None
-    checkpoints = outputs.checkpoints
-    if resume.required and not checkpoints.exist and outputs.ply.exists():
+    if resume.required and not outputs.checkpoint.exists() and outputs.ply.exists():
         raise CheckpointError(
             f"{outputs.ply}: exists without a checkpoint beside it, so this job is finished. To start again, leave "
             "--resume out."
         )
     try:
-        checkpoint = checkpoints.load(job_id, warn, resume.run)
+        checkpoint = load_checkpoint(outputs.checkpoint, job_id, resume.run)
     except CheckpointError:
         if resume.required:
             raise
@@ -311,7 +310,7 @@ def describe(job: Job) -> Prepared:
     lines.append(("schedule", f"{steps}; {rate} (preset {settings.preset})"))
     if job.resumed:
         lines.append(("resuming", f"at step {job.resumed.state.step} of {stylizer.job.total_steps}"))
-    elif job.outputs.checkpoints.exist:
+    elif job.outputs.checkpoint.exists():
         note = (
             f"{job.outputs.checkpoint} exists from an earlier run. This run starts from the beginning and replaces it; "
         )

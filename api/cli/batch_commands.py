@@ -195,7 +195,7 @@ def _make(
     print_field("complete" if entry.complete else "result", request.out)
     if entry.complete:
         return
-    resume = Outputs.of(request.out).checkpoints.exist
+    resume = Outputs.of(request.out).checkpoint.exists()
     worker_options = WorkerOptions(run.rank_timeout, run.checkpoint_seconds, resume_required=False)
     command = shlex.join(["sgsst", *invocation.arguments])
     run_job(request.model_copy(update={"resume": resume}), command, options.workers, worker_options)

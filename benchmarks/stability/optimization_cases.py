@@ -31,7 +31,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
+from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import ADAM_EPS, Stylizer
 
@@ -233,7 +233,7 @@ def _resumed(way: Way, full: bool) -> CaseResult:
         first.run_step()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "checkpoint.safetensors"
-        Checkpoints(path).save(Checkpoint(first.state(), first.job.plan, 1, "run", versions()), "job")
+        save_checkpoint(path, Checkpoint(first.state(), first.job.plan, 1, "run", versions()), "job")
         second.load_state(load_checkpoint(path, "job").state)
     run(second)
     return CaseResult(float((whole.sh_dc - second.sh_dc).detach().abs().max()), 0.0, "the same bits")

@@ -1,7 +1,6 @@
 """Checkpoints: safetensors files with everything that a resumed run needs, tied to their job by a fingerprint.
 
-The last two checkpoints of a job are stored. Each contains a digest of its content. If the newer one is damaged, the
-older one is used.
+A checkpoint contains a digest of its content.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -61,61 +60,14 @@ class Checkpoint:
     written_by: dict[str, str]
 
 
-class Checkpoints:
-    """Last two checkpoints of a job.
+def save_checkpoint(path: Path, checkpoint: Checkpoint, job: str) -> None:
+    """Write a checkpoint of the job with this fingerprint in place of an earlier one, atomically.
 
-    Args:
-        latest: Path of the newer file; the older one is in the same folder.
+    Raises:
+        OutputError: If the file cannot be written; an earlier checkpoint remains.
     """
-
-    def __init__(self, latest: Path) -> None:
-        self.latest = latest
-        self.previous = latest.with_name(f"{latest.stem}.previous{latest.suffix}")
-
-    @property
-    def exist(self) -> bool:
-        """Whether there is a checkpoint, of any job."""
-        return self.latest.exists() or self.previous.exists()
-
-    def save(self, checkpoint: Checkpoint, job: str) -> None:
-        """Write a new checkpoint and keep the previous one. A complete checkpoint exists at any moment.
-
-        Raises:
-            OutputError: If the file cannot be written; the newest existing checkpoint remains.
-        """
-        with atomic_path(self.latest) as temporary:
-            temporary.write_bytes(save(*_packed(checkpoint, job, checkpoint.run)))
-            if self.latest.exists():
-                self.latest.replace(self.previous)
-
-    def load(self, job: str, warn: Callable[[str], None], run: str | None = None) -> Checkpoint:
-        """Return the newest usable checkpoint of the job with this fingerprint.
-
-        Args:
-            warn: Callback for the reason why a checkpoint was skipped.
-            run: Program run whose checkpoints are accepted; None for any.
-
-        Raises:
-            CheckpointError: If there is no usable checkpoint.
-        """
-        try:
-            return load_checkpoint(self.latest, job, run)
-        except CheckpointError as error:
-            if not self.previous.exists():
-                raise
-            try:
-                checkpoint = load_checkpoint(self.previous, job, run)
-            except CheckpointError:
-                raise error from None
-            warn(
-                f"The checkpoint before the last one is used, of step {checkpoint.state.step}, because of this: {error}"
-            )
-            return checkpoint
-
-    def remove(self) -> None:
-        """Delete both checkpoints."""
-        self.latest.unlink(missing_ok=True)
-        self.previous.unlink(missing_ok=True)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(*_packed(checkpoint, job, checkpoint.run)))
 
 
 @functools.cache

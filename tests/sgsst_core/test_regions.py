@@ -41,7 +41,7 @@ from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import MAX_RESOLUTION, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, fingerprint, load_checkpoint, versions
+from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.job import JobInputs, check_style_size, prepare_job, prepared_style, rotated
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -465,7 +465,7 @@ def test_resumed_job_is_bit_identical(tiny_weights: BackboneWeights, tmp_path: P
     run(whole)
     for _ in range(3):
         first.run_step()
-    Checkpoints(tmp_path / "c").save(Checkpoint(first.state(), first.job.plan, 1, "r", versions()), "job")
+    save_checkpoint(tmp_path / "c", Checkpoint(first.state(), first.job.plan, 1, "r", versions()), "job")
     checkpoint = load_checkpoint(tmp_path / "c", "job")
     again = Stylizer(
         prepare_job(

@@ -16,7 +16,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.planning.plan import Plan
 from sgsst_core.progress import Progress
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.checkpoint import Checkpoints, load_checkpoint, save_plan
+from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint, save_plan
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.stylizing.test_refining import large_wall
@@ -84,7 +84,7 @@ def test_plan_for_another_device_reuses_the_survey(request_: JobSpec) -> None:
     run_job(first, steps=3)
     checkpoint = load_checkpoint(first.outputs.checkpoint, first.fingerprint)
     plan = replace(checkpoint.plan, device="cuda", rasterizer="cuda")
-    Checkpoints(first.outputs.checkpoint).save(replace(checkpoint, plan=plan), first.fingerprint)
+    save_checkpoint(first.outputs.checkpoint, replace(checkpoint, plan=plan), first.fingerprint)
     second = prepare(request_, resume=Resume(True))
     assert (second.stylizer.job.plan.device, second.stylizer.job.plan.rasterizer) == (
         "cpu",

@@ -17,9 +17,9 @@ from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import (
     Checkpoint,
-    Checkpoints,
     fingerprint,
     load_checkpoint,
+    save_checkpoint,
     versions,
 )
 from sgsst_core.stylizing.steps import StepRecord, StylizerState
@@ -90,14 +90,14 @@ def assert_same(expected: object, actual: object) -> None:
 
 
 def test_checkpoint_round_trips_exactly(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
-    Checkpoints(tmp_path / "c").save(full_checkpoint, "job")
+    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
     loaded = load_checkpoint(tmp_path / "c", "job")
     assert_same(full_checkpoint, loaded)
     torch.Generator().set_state(loaded.state.generator)
 
 
 def test_checkpoint_of_an_earlier_version_is_refused(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
-    Checkpoints(tmp_path / "c").save(full_checkpoint, "job")
+    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
     (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"9"', b'"version":"8"'))
     with pytest.raises(CheckpointError, match="another version of this program"):
         load_checkpoint(tmp_path / "c", "job")
@@ -124,7 +124,7 @@ def flipped(data: bytes, at: int) -> bytes:
 )
 def test_damaged_file_is_refused(full_checkpoint: Checkpoint, tmp_path: Path, damage: Any) -> None:
     path = tmp_path / "c"
-    Checkpoints(path).save(full_checkpoint, "job")
+    save_checkpoint(path, full_checkpoint, "job")
     before = path.read_bytes()
     path.write_bytes(damage(before))
     assert path.read_bytes() != before
@@ -132,36 +132,15 @@ def test_damaged_file_is_refused(full_checkpoint: Checkpoint, tmp_path: Path, da
         load_checkpoint(path, "job")
 
 
-def test_last_two_checkpoints_are_preserved(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
-    checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
+def test_latest_checkpoint_of_the_job_replaces_earlier_ones(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     for step in (1, 2, 3):
-        checkpoints.save(replace(full_checkpoint, state=replace(full_checkpoint.state, step=step)), "job")
-    assert len(list(tmp_path.iterdir())) == 2
-    assert load_checkpoint(checkpoints.latest, "job").state.step == 3
-    assert load_checkpoint(checkpoints.previous, "job").state.step == 2
-    checkpoints.remove()
-    assert not checkpoints.exist
-
-
-@pytest.mark.parametrize("spoil", ["truncated", "missing", "foreign"])
-def test_previous_checkpoint_replaces_an_unusable_one(full_checkpoint: Checkpoint, tmp_path: Path, spoil: str) -> None:
-    checkpoints = Checkpoints(tmp_path / "s.checkpoint.safetensors")
-    checkpoints.save(full_checkpoint, "job")
-    checkpoints.save(replace(full_checkpoint, state=replace(full_checkpoint.state, step=3)), "job")
-    if spoil == "truncated":
-        checkpoints.latest.write_bytes(checkpoints.latest.read_bytes()[:1000])
-    elif spoil == "missing":
-        checkpoints.latest.unlink()
-    else:
-        Checkpoints(tmp_path / "other").save(full_checkpoint, "another job")
-        (tmp_path / "other").replace(checkpoints.latest)
-    warnings: list[str] = []
-    assert (checkpoints.load("job", warnings.append).state.step, len(warnings)) == (2, 1)
-    assert "of step 2" in warnings[0]
-    with pytest.raises(CheckpointError, match="belongs to another job"):
-        checkpoints.load("yet another", warnings.append) if spoil == "foreign" else load_checkpoint(
-            checkpoints.previous, "yet another"
+        save_checkpoint(
+            tmp_path / "c", replace(full_checkpoint, state=replace(full_checkpoint.state, step=step)), "job"
         )
+    assert [path.name for path in tmp_path.iterdir()] == ["c"]
+    assert load_checkpoint(tmp_path / "c", "job").state.step == 3
+    with pytest.raises(CheckpointError, match="belongs to another job"):
+        load_checkpoint(tmp_path / "c", "another job")
 
 
 def test_fingerprint_distinguishes_jobs_but_not_their_budgets() -> None:

@@ -21,7 +21,7 @@ from sgsst_core.scene.colors import downscale
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PlannedPrecision, PresetName, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
+from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.job import JobInputs, prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.planner import Rates, estimate, plan_job
@@ -65,7 +65,7 @@ def test_resumed_run_is_bit_identical(tiny_weights: BackboneWeights, scene: Scen
         stopped.run_step()
     assert stopped.state().queue
     checkpoint = Checkpoint(stopped.state(), stopped.job.plan, 1, "run", versions())
-    Checkpoints(tmp_path / "c.safetensors").save(checkpoint, "job")
+    save_checkpoint(tmp_path / "c.safetensors", checkpoint, "job")
     resumed = make(tiny_weights, scene, steps_sos=8)
     resumed.load_state(load_checkpoint(tmp_path / "c.safetensors", "job").state)
     assert run(resumed) == "finished"
