@@ -1,15 +1,10 @@
-"""Chart of a report: its losses as columns, with running means on logarithmic axes, as PNG and as inline SVG.
-
-In SVG, colors are CSS variables with the printed color as fallback (`var(--c-222222, #222222)`), so a page can replace
-them on dark screens. Text uses the page's font.
-"""
+"""Chart of a report: its losses as columns, with running means on logarithmic axes, as PNG and as SVG."""
 
 from __future__ import annotations
 
 import io
 import math
 import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -348,12 +343,12 @@ class PageFigure:
     """Chart of the page.
 
     Attributes:
-        svg: <svg> element by quantity of the x axis, all of the same size.
+        svg: SVG image by quantity of the x axis, all of the same size.
     """
 
     title: str
     caption: str
-    svg: dict[Against, str]
+    svg: dict[Against, bytes]
 
 
 def draw_figure(report: dict[str, Any]) -> PageFigure | None:
@@ -370,60 +365,7 @@ def draw_figure(report: dict[str, Any]) -> PageFigure | None:
         with matplotlib.rc_context(STYLE):
             figure = Figure(figsize=_SIZE, layout="constrained")
             _draw_loss(figure, against, history, moments)
-            svg[against] = inline(figure, f"loss-{against}", f"{_TITLE}, against {against}")
+            file = io.BytesIO()
+            figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+            svg[against] = file.getvalue()
     return PageFigure(_TITLE, caption, svg)
-
-
-# --- SVG that can share a page with other figures ------------------------------------------------------------------
-
-_NAMESPACE = re.compile(r"\{[^}]*\}")
-_COLOR = re.compile(r"(fill|stroke): #([0-9a-f]{6})")
-_REFERENCE = re.compile(r"url\(#([^)]+)\)")
-_FAMILY = re.compile(r"font-family: [^;]*;?")
-_LONG_DECIMAL = re.compile(r"(\.\d\d)\d+")
-
-
-def inline(figure: Figure, name: str, label: str) -> str:
-    """Return a figure as an <svg> element that can share a page with other figures.
-
-    Its element IDs are prefixed with `name`, and it contains no style sheet.
-    """
-    file = io.BytesIO()
-    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # not needed, and has URLs of other servers
-    figure.savefig(file, format="svg", transparent=True, metadata=metadata)
-    root = ElementTree.fromstring(file.getvalue())
-    for parent in root.iter():
-        for child in list(parent):
-            if _NAMESPACE.sub("", child.tag) == "style":  # it would apply to the whole page
-                parent.remove(child)
-    links = [(key, value) for element in root.iter() for key, value in element.attrib.items()]
-    used = {value.removeprefix("#") for key, value in links if _NAMESPACE.sub("", key) == "href"}
-    used.update(reference for _, value in links for reference in _REFERENCE.findall(value))
-    for element in root.iter():
-        element.tag = _NAMESPACE.sub("", element.tag)
-        element.attrib = {
-            key: value
-            for key, value in (_rewritten(*item, name) for item in element.attrib.items())
-            if key != "id" or value.removeprefix(f"{name}-") in used
-        }
-    root.attrib = {"viewBox": root.attrib["viewBox"], "role": "img", "aria-label": label}
-    return ElementTree.tostring(root, encoding="unicode")
-
-
-def _rewritten(key: str, value: str, name: str) -> tuple[str, str]:
-    """Return an attribute as it appears on the page.
-
-    Its XML namespace is removed, IDs are prefixed with the figure's name, and coordinates are truncated to hundredths
-    of a point.
-    """
-    key = _NAMESPACE.sub("", key)
-    if key == "id":
-        return key, f"{name}-{value}"
-    if key == "href":
-        return key, f"#{name}-{value.removeprefix('#')}"
-    value = _REFERENCE.sub(rf"url(#{name}-\1)", value)
-    if key == "style":
-        return key, _FAMILY.sub("", _COLOR.sub(r"\1: var(--c-\2, #\2)", value))
-    if key in ("d", "points"):
-        value = " ".join(value.split())
-    return key, _LONG_DECIMAL.sub(r"\1", value) if key in ("d", "points", "x", "y", "transform") else value

@@ -10,12 +10,11 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.progress import NOTHING, byte_count, duration, number, percent
 from sgsst_core.report.charts import AGAINST, BINS, draw_figure, novel_view_moments, round_length
-from sgsst_core.report.images import ON_DARK, PAGE
+from sgsst_core.report.images import PAGE
 
 #: Fields of a report that have a section of their own on the page.
 _SECTIONS = ("history", "novel_views", "approximations", "loss_over_time", "findings", "plan", "seconds_by_part")
@@ -67,10 +66,6 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         sheet: Contact sheet as JPEG; None omits it.
         views: Sheet of all views as JPEG; None omits it.
     """
-    sheets = {
-        name: base64.b64encode(each).decode("ascii") if each else None
-        for name, each in (("sheet", sheet), ("views", views))
-    }
     figure = draw_figure(report)
     return _ENVIRONMENT.get_template("report.html").render(
         report=report,
@@ -78,18 +73,21 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         style=_style_names(report),
         stopped=_STOPPED.get(report["stopped"], report["stopped"]),
         colors=PAGE,
-        on_dark=ON_DARK,
         against=AGAINST,
         bins=BINS,
         round_length=round_length(report),
         figure=figure,
-        # All text in the figure is constant or escaped by the XML writer, so the SVGs are safe as markup.
-        drawings={name: Markup(svg) for name, svg in figure.svg.items()} if figure else {},
+        drawings={name: _base64(svg) for name, svg in figure.svg.items()} if figure else {},
         tables={name: table(report) for name, table in TABLES.items()},
         parts=_time_split(report),
         everything=_everything(report),
-        **sheets,
+        sheet=_base64(sheet) if sheet else None,
+        views=_base64(views) if views else None,
     )
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
 
 
 def _style_names(report: dict[str, Any]) -> str:
