@@ -57,14 +57,14 @@ class Survey:
         covered: Indices of the views that see anything.
         regions: Rectangle of each view that contains all covered pixels.
         uncovered_fraction: Fraction of uncovered pixels in the views that see anything.
-        uncovered: Fraction of uncovered pixels of each view, 1 if nothing is seen; None if not recorded per view.
+        uncovered: Fraction of uncovered pixels of each view, 1 if nothing is seen.
     """
 
     total_blend_weights: Tensor
     covered: list[int]
     regions: list[Rectangle]
     uncovered_fraction: float
-    uncovered: list[float] | None = None
+    uncovered: list[float]
 
 
 def survey_views(

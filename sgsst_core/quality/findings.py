@@ -16,18 +16,16 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MIN, FRUSTUM_MARGIN
-from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.scene_file import SceneFile
-from sgsst_core.planning.survey import Survey, sees_something
+from sgsst_core.planning.survey import Survey, survey_views
 from sgsst_core.quality.measure import scene_psnr
-from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.projection import Column, Shapes, project
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.colors import style_size
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering
-from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.style import Style
 
 #: Size relative to the scene's extent above which a Gaussian is larger than the scene.
@@ -96,10 +94,15 @@ def findings_of(
 
     Args:
         style: Style image [H, W, 3] or mixture; None skips the style.
-        survey: Existing survey of the cameras; None renders the views.
+        survey: Existing survey of the cameras; None surveys them.
+
+    Raises:
+        CameraError: If no camera sees a Gaussian.
+        TooManyIntersectionsError: If a view cannot be rendered.
     """
-    rasterizer = make_rasterizer("cpu", file.scene, near=near)  # lazy: nothing is allocated yet
-    findings = [*scene_findings(file), *view_findings(file, cameras, rasterizer, near=near, survey=survey)]
+    if survey is None:
+        survey = survey_views(file.scene, cameras, make_rasterizer("cpu", file.scene, near=near))
+    findings = [*scene_findings(file), *view_findings(file, cameras, survey, near=near)]
     images = () if style is None else Style.of(style).images
     return [*findings, *(finding for image in images for finding in style_findings(image, cameras))]
 
@@ -137,9 +140,6 @@ def scene_findings(file: SceneFile) -> list[Finding]:
 
 
 def _questions(scene: Scene, extent: float) -> list[_Question]:
-    rest = scene.sh_rest
-    stored = rest.largest() if isinstance(rest, StoredHarmonics) else None
-
     def longest(part: slice) -> Tensor:
         return scene.scales[part].double().amax(dim=1)
 
@@ -154,23 +154,15 @@ def _questions(scene: Scene, extent: float) -> list[_Question]:
     def dc(part: slice) -> Tensor:
         return scene.sh_dc[part].abs().amax(dim=1)
 
-    def higher(part: slice) -> Tensor:
-        if isinstance(rest, Tensor):
-            return rest[part].flatten(1).abs().amax(dim=1)
-        assert stored is not None
-        return stored[part]
-
     covers = "drawn; each may cover all raster tiles of all views, which costs time and memory"
     cubed = "unchanged; gradients grow with their third power, and a job stops if a gradient exceeds 1e19"
     reached = "; --target-loss may be reached at once, because they raise the initial loss"
-    large = f"SH coefficients above {LARGE_COEFFICIENT:g}"
-    questions = [
+    return [
         _Question("size that overflows (value: its logarithm)", "never drawn", longest, OVERFLOW_SCALE),
         _Question("longer than the scene's extent (value: ratio)", covers, relative, LARGE_SCALE),
         _Question("opacity below 1/255", "neither drawn nor optimized", opacity, ALPHA_MIN, below=True),
-        _Question(f"DC {large}", cubed + reached, dc, LARGE_COEFFICIENT),
+        _Question(f"DC SH coefficients above {LARGE_COEFFICIENT:g}", cubed + reached, dc, LARGE_COEFFICIENT),
     ]
-    return [*questions, _Question(f"higher {large}", cubed, higher, LARGE_COEFFICIENT)] if rest.shape[1] else questions
 
 
 def _asked(subject: Subject, file: SceneFile, question: _Question) -> list[Finding]:
@@ -213,19 +205,13 @@ def _scene_extent(scene: Scene) -> tuple[Tensor, float]:
     return center, extent or 1.0
 
 
-def view_findings(
-    file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer, *, near: float, survey: Survey | None = None
-) -> list[Finding]:
-    """Return the findings about the views, and about Gaussians that the views hardly or never show.
-
-    Args:
-        survey: Existing survey of the cameras; None renders each view, forward and backward.
-    """
-    if survey is not None and survey.uncovered is not None:
-        shown = [*_uncovered(survey.uncovered, cameras), *_seldom_seen(file, survey.total_blend_weights)]
-    else:
-        shown = _shown(file, cameras, rasterizer)
-    return [*_placed(file.scene, cameras, near), *shown]
+def view_findings(file: SceneFile, cameras: Sequence[Camera], survey: Survey, *, near: float) -> list[Finding]:
+    """Return the findings about the views, and about Gaussians that the views hardly or never show."""
+    return [
+        *_placed(file.scene, cameras, near),
+        *_uncovered(survey.uncovered, cameras),
+        *_seldom_seen(file, survey.total_blend_weights),
+    ]
 
 
 def _of_views(
@@ -245,7 +231,6 @@ def _placed(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Findin
         max(math.degrees(2 * math.atan(side / 2 / focal)) for side, focal in ((c.width, c.fx), (c.height, c.fy)))
         for c in cameras
     ]
-    off = [max(abs(c.cx / c.width - 0.5), abs(c.cy / c.height - 0.5)) for c in cameras]
     small = [float(min(c.width, c.height)) for c in cameras]
     centers = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(camera.center[None].double() for camera in cameras)])
     close = [float(count) for count in closer(scene.means, centers, near)]
@@ -255,11 +240,9 @@ def _placed(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Findin
     )
     skipped = "feature layers without a cell are skipped in its loss"
     behind = "not drawn if they are in front of the near plane; use --near to move it"
-    outside = "principal point outside the image (value: widths from its center)"
     inside = f"camera inside the scene: Gaussians within {near:g} of it (value: count)"
     rows = [
         (f"field of view above {WIDE:g} degrees", angles, [angle > WIDE for angle in angles], linearized),
-        (outside, off, [value > 0.5 for value in off], "drawn like any other view; check that this is intended"),
         (f"fewer than {ALIGNMENT} pixels on a side", small, [value < ALIGNMENT for value in small], skipped),
         (inside, close, [count > 0 for count in close], behind),
     ]
@@ -281,27 +264,6 @@ def closer(means: Tensor, centers: Tensor, distance: float) -> list[int]:
         for view in range(len(centers) if len(points) else 0):
             counts[view] += int(((points - centers[view]).norm(dim=1) < distance).sum())
     return counts
-
-
-def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -> list[Finding]:
-    """Render all views, and report uncovered views and hardly seen Gaussians."""
-    blend_weights = torch.zeros(len(file.scene), dtype=torch.float64)
-    uncovered: list[float] = []
-    refused: list[str] = []
-    for camera in cameras:
-        try:
-            coverage, weights = rasterizer.survey(camera)
-        except TooManyIntersectionsError as error:
-            refused.append(str(error))
-            uncovered.append(0.0)
-            continue
-        seen = sees_something(coverage)
-        uncovered.append(float((1 - coverage).mean(dtype=torch.float64)) if seen else 1.0)
-        blend_weights += weights.cpu()
-    if not refused:
-        return [*_uncovered(uncovered, cameras), *_seldom_seen(file, blend_weights)]
-    stopped = Finding("views", "cannot be rendered", len(refused), len(cameras), refused[0], "stops the job")
-    return [stopped, *_uncovered(uncovered, cameras)]
 
 
 def _uncovered(fractions: list[float], cameras: Sequence[Camera]) -> list[Finding]:
@@ -393,9 +355,6 @@ def small_gaussians(scene: Scene, cameras: Sequence[Camera], near: float) -> tup
 
 def _difference(scene: Scene, rendering: Rendering, views: Sequence[Camera], near: float) -> str:
     """Return how much renders in another mode differ, as text."""
-    try:
-        psnr = scene_psnr(scene, replace(scene, rendering=rendering), views, near=near)
-    except TooManyIntersectionsError:  # reported as a finding of the views
-        return ""
+    psnr = scene_psnr(scene, replace(scene, rendering=rendering), views, near=near)
     differ = "the same renders as" if psnr is None else f"{psnr:.1f} dB PSNR against"
     return f"{differ} {rendering.text}, in {len(views)} views"

@@ -197,16 +197,6 @@ class StoredHarmonics:
         self.for_blocks(copy, threads=None if values.device.type == "cpu" else 1)
         return values
 
-    def largest(self) -> Tensor:
-        """Return the largest magnitude among the coefficients of each Gaussian, [N] float32."""
-        largest = torch.empty(len(self))
-
-        def take(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
-            largest[start : start + len(rows)] = torch.from_numpy(np.abs(block[rows]).max(axis=(1, 2)))
-
-        self.for_blocks(take)
-        return largest
-
     def for_blocks(self, work: BlockWork, threads: int | None = None) -> None:
         """Call a function on all coefficients, block by block, on as many cores as PyTorch uses.
 

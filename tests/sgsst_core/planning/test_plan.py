@@ -65,7 +65,7 @@ def facts(
     return Facts(
         gaussians=gaussians,
         sizes=(size,) * views,
-        survey=Survey(weights, list(range(views)), regions, uncovered),
+        survey=Survey(weights, list(range(views)), regions, uncovered, [uncovered] * views),
         machine=machine,
         **given,
     )

@@ -54,7 +54,8 @@ def state() -> StylizerState:
 @pytest.fixture
 def full_checkpoint(state: StylizerState) -> Checkpoint:
     seen = torch.tensor([True, True, False, True, True])
-    survey = Survey(torch.rand(5, dtype=torch.float64), [0, 2], [Rectangle(0, 1, 2, 3), Rectangle(4, 5, 6, 7)], 1 / 3)
+    regions = [Rectangle(0, 1, 2, 3), Rectangle(4, 5, 6, 7)]
+    survey = Survey(torch.rand(5, dtype=torch.float64), [0, 2], regions, 1 / 3, [0.0, 1 / 3])
     pieces = torch.tensor([[1, 1, 1], [3, 1, 1]], dtype=torch.uint8)
     plan = Plan(
         survey=survey,
