@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from collections.abc import Callable, Hashable
 from typing import Generic, Literal, TypeVar
 
@@ -105,8 +104,7 @@ class Cache(Generic[K, V]):
     Attributes:
         values: Cached values by key, oldest first.
         used: Size in bytes of the values within the budget.
-        costs: Size in bytes and seconds of each value that has been computed, by key. The seconds are those of the
-            latest time, without the time for values of other caches.
+        sizes: Size in bytes of each value that has been computed, by key.
     """
 
     def __init__(
@@ -115,7 +113,7 @@ class Cache(Generic[K, V]):
         self.capacity = capacity
         self.values: dict[K, V] = {}
         self.used = 0
-        self.costs: dict[K, tuple[int, float]] = {}
+        self.sizes: dict[K, int] = {}
         self._size = size
         self._holds_latest = holds_latest
         self._latest: tuple[K, V] | None = None
@@ -135,11 +133,11 @@ class Cache(Generic[K, V]):
             if self._latest is not None and self._latest[0] == key:
                 return self._latest[1]
             self._latest = None  # free its memory before the next one is computed
-            value, seconds = _timed(make)
+            value = make()
             if size is None:
                 assert self._size is not None
                 size = self._size(value)
-            self.costs[key] = size, seconds
+            self.sizes[key] = size
             if self.has_space(size):
                 self._store(key, value, size)
             elif self._holds_latest:
@@ -154,11 +152,10 @@ class Cache(Generic[K, V]):
         """
         with self._lock:
             if key not in self._decided:
-                (size, make), counting = _timed(count)
+                size, make = count()
                 if self.has_space(size):
-                    value, seconds = _timed(make)
-                    self.costs[key] = size, counting + seconds
-                    self._store(key, value, size)
+                    self.sizes[key] = size
+                    self._store(key, make(), size)
                 self._decided.add(key)
 
     def __contains__(self, key: K) -> bool:
@@ -174,13 +171,13 @@ class Cache(Generic[K, V]):
         with self._lock:
             self._latest = None
             if self.values.pop(key, None) is not None:
-                self.used -= self.costs[key][0]
+                self.used -= self.sizes[key]
 
     def clear(self) -> None:
         """Remove all values."""
         with self._lock:
             self._latest = None
-            for record in (self.values, self.costs, self._decided):
+            for record in (self.values, self.sizes, self._decided):
                 record.clear()
             self.used = 0
 
@@ -190,24 +187,8 @@ class Cache(Generic[K, V]):
             self.capacity = capacity
             while self.used > capacity:
                 key, _ = self.values.popitem()
-                self.used -= self.costs[key][0]
+                self.used -= self.sizes[key]
 
     def _store(self, key: K, value: V, size: int) -> None:
         self.values[key] = value
         self.used += size
-
-
-#: Seconds that the present thread has spent on values inside of the one that it computes.
-_inside = threading.local()
-
-
-def _timed(make: Callable[[], V]) -> tuple[V, float]:
-    """Return the result of a function, and its seconds without those of calls of `_timed` inside of it."""
-    outside, _inside.seconds = getattr(_inside, "seconds", 0.0), 0.0
-    started = time.perf_counter()
-    try:
-        value = make()
-        total = time.perf_counter() - started
-        return value, total - _inside.seconds
-    finally:
-        _inside.seconds = outside + time.perf_counter() - started

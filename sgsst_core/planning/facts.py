@@ -253,7 +253,7 @@ def count_weights(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> tuple[in
 def count_intersections(rasterizer: Rasterizer, views: int) -> int:
     """Return the bytes of the tile intersections of all views, from those that the survey has computed."""
     cache = rasterizer.caches.get("intersections")
-    sizes = [size for size, _ in cache.costs.values()] if cache is not None else []
+    sizes = list(cache.sizes.values()) if cache is not None else []
     return sum(sizes) * views // max(len(sizes), 1)
 
 

@@ -294,7 +294,7 @@ class StylizationJob:
         view_targets: Targets of the views, except the style's.
         memory_limit: Memory budget in bytes of all ranks on one machine together. It determines the partition, and
             thereby rounding, so it is identical on all ranks.
-        survey_seconds: About the seconds of the rasterizer's pass over a view; 0 if unknown.
+        survey_seconds: Seconds of the rasterizer's pass over a view, mean; 0 if unknown.
     """
 
     plan: Plan

@@ -15,7 +15,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 import torch
@@ -83,6 +82,7 @@ def plan_job(
     """
     _check_cameras(inputs)
     timer, chosen, context = timer or Timer(), inputs.chosen, None
+    survey_seconds = 0.0
     settings = chosen.applied(inputs.settings) if chosen else inputs.settings
     if plan is None:
         with timer("planning"):
@@ -91,8 +91,10 @@ def plan_job(
             weights = weights_for(inputs.weights, settings)
             context = equip(inputs.scene, fitted, settings, weights, collectives, inputs.rasterizer)
             if survey is None:
+                started = time.perf_counter()
                 with timer("survey"):
                     survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
+                survey_seconds = (time.perf_counter() - started) * collectives.size / len(fitted)
             about = [*_about_inputs(inputs, settings, survey, fitted)]
             facts = collectives.broadcast(lambda: _facts(context, survey, inputs.regions))
             plan = make_plan(facts, settings, groups=groups, measured=inputs.measured, about=about)
@@ -102,10 +104,7 @@ def plan_job(
     with timer("preparing"):
         inputs = replace(inputs, settings=with_groups(settings, plan.groups))
         job = prepare_job(plan, inputs, collectives=collectives, planning_context=context)
-    cache = context.rasterizer.caches.get("intersections") if context else None
-    costs = [seconds for _, seconds in cache.costs.values()] if cache is not None else []
-    # The median, because the first view may compile kernels; a pass takes about as long as the intersections.
-    return replace(job, survey_seconds=2 * median(costs)) if costs else job
+    return replace(job, survey_seconds=survey_seconds)
 
 
 def _check_cameras(inputs: JobInputs) -> None:
