@@ -84,7 +84,7 @@ class History:
 
     Attributes:
         x: Elapsed seconds, and number of steps.
-        limits: Limits of each x axis, which include the measurements of novel views.
+        limits: Limits of each x axis.
         phases: Name of each phase's stage, and slice of its steps.
         relative: Loss by scale, relative to the unstylized scene.
         mean_relative: Mean over scales, relative to the unstylized scene; NaN for steps on a single scale.
@@ -122,13 +122,9 @@ def history_of(report: dict[str, Any]) -> History:
     several = [len(record["scales"]) > 1 for record in records]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         relative = {scale: losses[scale] / starts[scale] for scale in scales}
-    moments = novel_view_moments(report)
     return History(
         x=x,
-        limits={
-            against: log_limits(np.append(x[against], _moment_positions(moments, against)), X_MARGIN)
-            for against in AGAINST
-        },
+        limits={against: log_limits(x[against], X_MARGIN) for against in AGAINST},
         phases=phases,
         relative=relative,
         mean_relative=np.where(several, column([record["relative"] for record in records]), math.nan),
@@ -151,16 +147,6 @@ def column(values: Sequence[float | None]) -> Floats:
 def joined(columns: Sequence[Floats]) -> Floats:
     """Concatenate columns; the list may be empty."""
     return np.concatenate([np.empty(0), *columns])
-
-
-def novel_view_moments(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the report's measurements of novel views; empty if there are none."""
-    return (report.get("novel_views") or {}).get("moments") or []
-
-
-def _moment_positions(moments: Sequence[dict[str, Any]], against: Against) -> Floats:
-    """Return the x positions [n] of measurements."""
-    return column([moment.get("seconds" if against == "seconds" else "step") for moment in moments])
 
 
 def _drawable(values: Floats) -> NDArray[np.bool_]:
@@ -214,8 +200,8 @@ def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
     return means
 
 
-def _draw_loss(figure: Figure, against: Against, history: History, moments: Sequence[dict[str, Any]]) -> None:
-    """Draw the loss of each scale and their mean, relative to the start, and the Gram distance of novel views.
+def _draw_loss(figure: Figure, against: Against, history: History) -> None:
+    """Draw the loss of each scale and their mean, relative to the start.
 
     Lines are running means over one round of views, with the range of the values shaded behind.
     """
@@ -226,12 +212,8 @@ def _draw_loss(figure: Figure, against: Against, history: History, moments: Sequ
         lines.append(("mean", history.mean_relative, INK))
     for label, values, color in lines:
         _draw_line(axes, history, against, values, color, label)
-    x, gram = _moment_positions(moments, against), column([moment.get("gram_relative") for moment in moments])
-    shown = _drawable(x) & _drawable(gram)
-    label = "Gram distance, novel views"
-    draw_points(axes, x[shown], gram[shown], marker="D", linestyle="", color=INK, markerfacecolor="none", label=label)
     set_log_x(axes, history.limits[against], against)
-    set_log_y(axes, [*(values for _, values, _ in lines), gram[shown]])
+    set_log_y(axes, [values for _, values, _ in lines])
     axes.set_ylabel(RELATIVE_LOSS)
     draw_legend(figure)
 
@@ -243,7 +225,7 @@ def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
         report: Report from `build_report`; its history may be empty.
     """
     with png_chart(path, (8, 4.8), dpi=120) as figure:
-        _draw_loss(figure, "seconds", history_of(report), novel_view_moments(report))
+        _draw_loss(figure, "seconds", history_of(report))
 
 
 @contextmanager
@@ -282,20 +264,12 @@ def draw_points(axes: Axes, x: Floats, values: Floats, **options: Any) -> None:
 
 
 def _mark_phases(axes: Axes, history: History, against: Against) -> None:
-    """Label the phases above the axes, the first at its start and the last at its end, with lines between them."""
-    transform = axes.get_xaxis_transform()
-    borders = [history.limits[against][0]]
-    for _, part in history.phases[1:]:
-        borders.append(max(float(history.x[against][part.start - 1]), borders[0]))
-        axes.axvline(borders[-1], color=INK, linewidth=0.8, linestyle=":")
-    borders.append(history.limits[against][1])
-    last = len(history.phases) - 1
-    for index, (stage, _) in enumerate(history.phases):
-        start, end = borders[index], borders[index + 1]
-        place, side = (start, "left") if index == 0 else (end, "right")
-        if 0 < index < last:
-            place, side = math.sqrt(start) * math.sqrt(end), "center"
-        name = _PHASE_NAMES.get(stage, stage)
+    """Label the first phase above the start of the axes and the second one above the end, with a line between them."""
+    low, high = history.limits[against]
+    for (stage, part), place, side in zip(history.phases, (low, high), ("left", "right"), strict=False):
+        if part.start:
+            axes.axvline(max(float(history.x[against][part.start - 1]), low), color=INK, linewidth=0.8, linestyle=":")
+        name, transform = _PHASE_NAMES.get(stage, stage), axes.get_xaxis_transform()
         axes.text(place, 1.02, name, transform=transform, ha=side, fontsize=8.5, parse_math=False)
 
 
@@ -355,7 +329,7 @@ def draw_figure(report: dict[str, Any]) -> PageFigure | None:
     """Draw the chart of a report; return None if no step was made."""
     if not report["history"]:
         return None
-    history, moments = history_of(report), novel_view_moments(report)
+    history = history_of(report)
     losses = column([terms["total"] for record in report["history"] for terms in record["scales"].values()])
     undrawn, caption = int((~_drawable(losses)).sum()), "Loss, divided by that of the unstylized scene."
     if undrawn:  # a logarithmic axis cannot show them
@@ -364,7 +338,7 @@ def draw_figure(report: dict[str, Any]) -> PageFigure | None:
     for against in AGAINST:
         with matplotlib.rc_context(STYLE):
             figure = Figure(figsize=_SIZE, layout="constrained")
-            _draw_loss(figure, against, history, moments)
+            _draw_loss(figure, against, history)
             file = io.BytesIO()
             figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
             svg[against] = file.getvalue()

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.progress import NOTHING, byte_count, duration, number, percent
-from sgsst_core.report.charts import AGAINST, BINS, draw_figure, novel_view_moments, round_length
+from sgsst_core.report.charts import AGAINST, BINS, draw_figure, round_length
 from sgsst_core.report.images import PAGE
 
 #: Fields of a report that have a section of their own on the page.
@@ -160,26 +160,18 @@ def _loss_table(report: dict[str, Any]) -> Table:
     )
 
 
-def _consistency_at(moment: dict[str, Any], reach: str) -> dict[str, Any]:
-    """Return a moment's consistency at a range, "short" or "long"; empty if it has none."""
-    return (moment.get("consistency") or {}).get(reach) or {}
-
-
 def _novel_views_table(report: dict[str, Any]) -> Table | None:
     """Return all measurements of novel views, without empty columns; None if there are none."""
-    moments = novel_view_moments(report)
+    moments = (report.get("novel_views") or {}).get("moments") or []
     if not moments:
         return None
-    scales = sorted({scale for moment in moments for scale in moment.get("gram") or {}}, key=int)
     columns: dict[str, list[str]] = {
         "step": [f"{moment['step']:,}" for moment in moments],
         "time": [duration(moment["seconds"]) for moment in moments],
         "Gram distance, relative": [number(moment.get("gram_relative")) for moment in moments],
     }
-    for scale in scales:
-        columns[f"scale {scale}, absolute"] = [number((moment.get("gram") or {}).get(scale)) for moment in moments]
     for reach in ("short", "long"):
-        consistencies = [_consistency_at(moment, reach) for moment in moments]
+        consistencies = [(moment.get("consistency") or {}).get(reach) or {} for moment in moments]
         columns[f"RMSE, {reach} range"] = [number(entry.get("rmse")) for entry in consistencies]
         columns[f"LPIPS, {reach} range"] = [number(entry.get("lpips")) for entry in consistencies]
         columns[f"compared, {reach} range"] = [percent(entry.get("compared")) for entry in consistencies]
