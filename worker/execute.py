@@ -189,7 +189,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
     if stylizer.job.collectives.broadcast(lambda: stopped != "on-request" and (left is None or left() > 0)):
         measure.at_the_end()
     # The initial loss is evaluated here, because evaluating it before the first step would delay the job.
-    before = measure.evaluate(unstylized=True)
+    before = measure.start()
     weights = stylizer.job.loss.weights
     after = round_evaluation(stylizer.history, stylizer.job.round_length, weights)
     error = _write_reports(job, stopped, before, after, compressed) if first else None

@@ -41,10 +41,7 @@ from sgsst_core.stylizing.views import Views, ViewTargets
 class Measurements:
     """Quality measurements of a job, for as many novel views as its plan says.
 
-    The unstylized scene (step 0) and the result each append a JSON-serializable entry to `Stylizer.measured`, with the
-    fields "step", "novel_views" and "approximation" (None if there is nothing to measure). The first entry names the
-    views. If AlexNet is installed, the last entry holds the `Judgment` of the result as "judged", with the fields
-    "before" and "after". Networks and views are created at first use.
+    They are stored in `Stylizer.measured`. Networks and views are created at first use.
 
     Args:
         show: Callback before each view of a measurement, with the number of completed and of all views.
@@ -59,51 +56,50 @@ class Measurements:
         """Exact loss and gradient of the job."""
         return Float32Reference(self._stylizer, memory_for("measuring", self._stylizer.job.memory))
 
-    def evaluate(self, *, unstylized: bool = False) -> Evaluation:
-        """Return the exact loss on the evaluation views, for the current colors or the unstylized scene."""
+    def start(self) -> Evaluation:
+        """Return the exact loss of the unstylized scene on the evaluation views."""
         stylizer = self._stylizer
-        if unstylized and not self.approximated:
+        if not self.approximated:
             return stylizer.start(self._show)
         with stylizer.measuring():
-            if not self.approximated:
-                return stylizer.evaluate(stylizer.job.evaluation_views, stylizer.shown(), self._show)
-            colors = stylizer.job.scene.sh_dc if unstylized else stylizer.stylized()
-            return self.exact.evaluate(stylizer.job.evaluation_views, colors, self._show)
+            return self.exact.evaluate(stylizer.job.evaluation_views, stylizer.job.scene.sh_dc, self._show)
 
     def at_the_end(self) -> None:
-        """Measure the unstylized scene and the result, and judge the result."""
-        if self._stylizer.job.plan.novel_views and not self._stylizer.measured:
+        """Measure the unstylized scene and the result, and judge both."""
+        if self._stylizer.job.plan.novel_views:
             with self._stylizer.measuring():
-                self._measure(start=True)
-                self._measure(start=False)
-                self._judge()
+                self._stylizer.measured = self._measured()
 
-    def _judge(self) -> None:
-        """Judge the result and the unstylized scene on the first rank.
+    def _measured(self) -> dict[str, Any]:
+        """Return the fields `novel_views` and `approximations` of the report."""
+        stylizer, novel_views = self._stylizer, self._novel_views
+        moments, errors = [], []
+        for start in (True, False):
+            if self.approximated:
+                errors.append(asdict(self.exact.gradient_error(start=start)))
+            if novel_views.views:
+                moment = novel_views.measure(stylizer.job.scene.sh_dc if start else stylizer.stylized(), self._show)
+                moments.append(moment.as_dict(0, 0.0) if start else moment.as_dict(stylizer.step, stylizer.seconds))
+        between = {
+            "views": [novel_views.cameras[index].name for index in novel_views.views],
+            "lpips": novel_views.lpips.network if novel_views.lpips else None,
+            "moments": moments,
+            "judged": self._judged(),
+        }
+        return {
+            "novel_views": between if moments else None,
+            "approximations": {"what": self.approximated, "moments": errors} if errors else None,
+        }
 
-        The judgment is added to the last entry as "judged".
-        """
+    def _judged(self) -> dict[str, Any] | None:
+        """Return the judgments of the unstylized scene and of the result; None without AlexNet, or if not rank 0."""
         stylizer, novel_views = self._stylizer, self._novel_views
         if not isinstance(novel_views.lpips, Lpips) or stylizer.job.collectives.rank:
-            return
+            return None
         judge = make_judge(stylizer, novel_views, novel_views.lpips)
         colors = {"before": stylizer.job.scene.sh_dc, "after": stylizer.stylized()}
         judgments = {name: judge.judge(sh_dc) for name, sh_dc in colors.items()}
-        stylizer.measured[-1]["judged"] = {name: asdict(one) for name, one in judgments.items() if one} or None
-
-    def _measure(self, *, start: bool) -> None:
-        """Measure the unstylized scene or the result, and append an entry."""
-        stylizer, novel_views, own = self._stylizer, self._novel_views, dict[str, Any]()
-        colors = (stylizer.job.scene.sh_dc if start else stylizer.stylized()).to(novel_views.rasterizer.device)
-        if start:
-            own["novel_view_names"] = [novel_views.cameras[index].name for index in novel_views.views]
-            own["lpips"] = novel_views.lpips.network if novel_views.lpips else None
-            own["approximated"] = self.approximated
-        approximation = asdict(self.exact.gradient_error(start=start)) if self.approximated else None
-        step, seconds, moment = (0, 0.0, None) if start else (stylizer.step, stylizer.seconds, None)
-        if novel_views.views:
-            moment = novel_views.measure(colors, self._show).as_dict(step, seconds)
-        stylizer.measured.append({"step": step, "novel_views": moment, "approximation": approximation, **own})
+        return {name: asdict(one) for name, one in judgments.items() if one} or None
 
     @cached_property
     def _novel_views(self) -> NovelViews:

@@ -89,7 +89,6 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
     """Return program, time, losses and measurements of a job."""
     coarse = sum(record.stage == "coarse" for record in stylizer.history)
     weights = stylizer.job.loss.weights
-    errors = [entry["approximation"] for entry in stylizer.measured if entry["approximation"]]
     return {
         "version": REPORT_VERSION,
         "program": {"name": "sgsst-service", "version": versions()["program"]},
@@ -112,8 +111,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
         },
         "loss_over_time": loss_over_time(stylizer, before, stopped),
         "measuring": _measuring_json(stylizer),
-        "novel_views": _novel_views_json(stylizer.measured),
-        "approximations": {"what": stylizer.measured[0]["approximated"], "moments": errors} if errors else None,
+        **stylizer.measured,
     }
 
 
@@ -253,12 +251,13 @@ def _step_seconds(stylizer: Stylizer, stage: str) -> float | None:
 def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
     """Return the number of measurements, their time, and its ratio to the time of the steps."""
     seconds = stylizer.seconds_by_part.get("measuring", 0.0)
+    novel_views = stylizer.measured["novel_views"]
     return {
         "fraction": stylizer.job.settings.measure,
         "seconds": round(seconds, 3),
         "of_steps": seconds / stylizer.seconds if stylizer.seconds else None,
         "loss_views": len(stylizer.job.evaluation_views),
-        "novel_view_count": len(stylizer.measured[0].get("novel_view_names", [])) if stylizer.measured else 0,
+        "novel_view_count": len(novel_views["views"]) if novel_views else 0,
     }
 
 
@@ -337,15 +336,6 @@ def _more_time(stylizer: Stylizer, records: Sequence[StepRecord], relative: floa
         f"{longer} would lower the rest of the loss on these views from {percent(relative)} to about {percent(rest)}."
     )
     return {"steps": round(factor * stylizer.step), "relative": rest, "text": text}
-
-
-def _novel_views_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return the quality on novel views at each moment; None if no novel view was measured."""
-    moments = [entry["novel_views"] for entry in measured if entry["novel_views"]]
-    if not moments:
-        return None
-    views, lpips = measured[0]["novel_view_names"], measured[0]["lpips"]
-    return {"views": views, "lpips": lpips, "moments": moments, "judged": measured[-1].get("judged")}
 
 
 def _evaluation_json(evaluation: Evaluation, weights: ScaleWeights) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from sgsst_core.stylizing.steps import StylizerState
 T = TypeVar("T")
 
 #: Increased whenever the meaning of a stored value changes.
-FORMAT_VERSION = "9"
+FORMAT_VERSION = "10"
 #: Settings that may differ between a checkpoint and the run that resumes from it. They only end the run or select
 #: measurements; the memory limit, which determines the partition, changes only rounding.
 _FREE_SETTINGS = {"within", "fixed", "target_loss", "early_stop", "memory_limit", "measure"}

@@ -6,7 +6,6 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -137,7 +136,6 @@ class StylizerState:
     seconds_by_part: dict[str, float] = field(default_factory=dict)
     # memory budget in bytes: it determines partition and cached weights, and thereby rounding
     memory: int | None = None
-    measured: list[dict[str, Any]] = field(default_factory=list)  # see `Stylizer.measured`
 
 
 Evaluation = dict[int, LossTerms]

@@ -351,7 +351,7 @@ class Stylizer:
 
     Attributes:
         sh_dc: [n, 3], present colors of the rendered Gaussians, on the rasterizer's device.
-        measured: Measurements before and after the steps, JSON-serializable.
+        measured: Fields `novel_views` and `approximations` of the report; None where nothing was measured.
     """
 
     def __init__(self, job: StylizationJob) -> None:
@@ -360,7 +360,7 @@ class Stylizer:
         self.seconds = 0.0
         self.seconds_by_part: dict[str, float] = {}
         self.history: list[StepRecord] = []
-        self.measured: list[dict[str, Any]] = []
+        self.measured: dict[str, Any] = {"novel_views": None, "approximations": None}
         self.latest: list[int] = []
         settings, views, seen = job.settings, job.views, job.plan.seen
         device = views.rasterizer.device
@@ -734,7 +734,6 @@ class Stylizer:
             history=list(self.history),
             seconds_by_part=dict(self.seconds_by_part),
             memory=self.job.memory_limit,
-            measured=list(self.measured),
         )
 
     def load_state(self, state: StylizerState) -> None:
@@ -752,5 +751,4 @@ class Stylizer:
         own = {name: self.seconds_by_part[name] for name in BEFORE_STEPS if name in self.seconds_by_part}
         earlier = state.seconds_by_part
         self.seconds_by_part = {**earlier, **{name: earlier.get(name, 0.0) + own[name] for name in own}}
-        self.measured = list(state.measured)
         self._visited_before = state.step

@@ -204,7 +204,7 @@ def test_evaluated_loss_covers_the_weighted_scales(tiny_weights: BackboneWeights
     run(stylizer)
     stylizer.job = replace(stylizer.job, plan=replace(stylizer.job.plan, novel_views=1))
     Measurements(stylizer).at_the_end()
-    assert set(map(int, stylizer.measured[-1]["novel_views"]["gram"])) == {0, 2}
+    assert set(map(int, stylizer.measured["novel_views"]["moments"][-1]["gram"])) == {0, 2}
 
 
 def test_drawn_scales_are_the_same_after_a_resume_and_losses_cover_all(tiny_weights: BackboneWeights) -> None:

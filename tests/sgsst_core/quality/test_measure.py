@@ -33,24 +33,23 @@ def make(weights: BackboneWeights, measure: float = 0.75, **values: Any) -> Styl
 
 
 def measured(stylizer: Stylizer, stop: Any = None) -> list[int]:
-    """Run a job, measure it at its end, and return the numbers of steps in the entries."""
+    """Run a job, measure it at its end, and return the numbers of steps of the moments."""
     run(stylizer, Callbacks(stop=stop))
-    assert stylizer.measured == [], "nothing is measured between steps"
+    assert stylizer.measured["novel_views"] is None, "nothing is measured between steps"
     Measurements(stylizer).at_the_end()
-    return [entry["step"] for entry in stylizer.measured]
+    return [moment["step"] for moment in (stylizer.measured["novel_views"] or {"moments": []})["moments"]]
 
 
-def test_start_and_end_are_measured_once_without_effect(tiny_weights: BackboneWeights) -> None:
+def test_start_and_end_are_measured_without_effect(tiny_weights: BackboneWeights) -> None:
     stylizer, nothing = make(tiny_weights), make(tiny_weights, measure=0.0)
     assert (measured(nothing), measured(stylizer)) == ([], [0, STEPS])
-    first, last = stylizer.measured
-    assert len(first["novel_view_names"]) == stylizer.job.plan.novel_views == 1
-    assert first["novel_views"]["gram_relative"] == 1 > last["novel_views"]["gram_relative"]
-    assert all(value > 0 for value in last["novel_views"]["gram"].values())
+    novel_views = stylizer.measured["novel_views"]
+    first, last = novel_views["moments"]
+    assert len(novel_views["views"]) == stylizer.job.plan.novel_views == 1
+    assert first["gram_relative"] == 1 > last["gram_relative"]
+    assert all(value > 0 for value in last["gram"].values())
     assert stylizer.seconds_by_part["measuring"] > 0
     assert torch.equal(nothing.stylized(), stylizer.stylized())
-    Measurements(stylizer).at_the_end()
-    assert len(stylizer.measured) == 2
 
 
 def test_interrupted_job_is_measured_after_its_last_step(tiny_weights: BackboneWeights) -> None:
@@ -64,7 +63,7 @@ def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: Ba
     other.run_step()
     for stylizer in (usual, other):
         Measurements(stylizer).at_the_end()
-    start, same = (stylizer.measured[0]["novel_views"]["gram"] for stylizer in (other, usual))
+    start, same = (stylizer.measured["novel_views"]["moments"][0]["gram"] for stylizer in (other, usual))
     assert start == pytest.approx(same, rel=1e-6)
     assert all(terms["nearest"] > 0 for terms in other.history[-1].terms.values())
 
