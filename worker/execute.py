@@ -20,7 +20,7 @@ from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.progress import Progress
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import CompressionLoss, Measurements, measure_compression
-from sgsst_core.report.document import build_report, loss_over_time, plan_json, seconds_json, sent_json
+from sgsst_core.report.document import build_report, loss_over_time, plan_json, seconds_json
 from sgsst_core.report.images import write_contact_sheet, write_views
 from sgsst_core.stylizing.checkpoint import Checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.loop import Callbacks, Stopped, run
@@ -252,9 +252,8 @@ def _write_reports(
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
         report |= seconds_json(stylizer, job.seconds)
         lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
-        sent = sent_json(stylizer.history)
         report["compressed"] = compressed and compressed.as_dict()
-        report["workers"] = {**job.workers, "bytes_sent": sent, "seconds_lost": round(lost, 3)}
+        report["workers"] = {**job.workers, "seconds_lost": round(lost, 3)}
         write_json(outputs.report, report)
         write_contact_sheet(outputs.sheet, stylizer)
         write_loss_chart(outputs.curves, report)

@@ -15,7 +15,6 @@ import torch
 from sgsst_core import container
 from sgsst_core.budget import device_peak, peak_memory
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.parallel.collectives import TRAFFIC
 from sgsst_core.planning.time_budget import LONGER
 from sgsst_core.progress import duration, percent
 from sgsst_core.quality.findings import Finding
@@ -259,16 +258,6 @@ def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
         "loss_views": len(stylizer.job.evaluation_views),
         "novel_view_count": len(novel_views["views"]) if novel_views else 0,
     }
-
-
-def sent_json(history: Sequence[StepRecord]) -> dict[str, dict[str, int]] | None:
-    """Return the median bytes that the first rank sends per step, by phase and kind; None for a single rank."""
-    medians: dict[str, dict[str, int]] = {}
-    for stage in ("coarse", "sos"):
-        steps = [record.sent for record in history if record.stage == stage and record.sent]
-        if steps:
-            medians[stage] = {kind: int(median(step.get(kind, 0) for step in steps)) for kind in TRAFFIC}
-    return medians or None
 
 
 #: Reasons to stop after which more time might pay, and minimum factor of steps for which the loss is predicted.

@@ -101,7 +101,6 @@ class StepRecord:
         terms: Loss by scale and term; of scales that the step has not evaluated, an estimate (`completed`).
         parts: Time in seconds of this step by activity.
         memory: Physical memory of the process after the step, in bytes.
-        sent: Bytes sent by this rank to others, by purpose (`collectives.Traffic`); empty for a single rank.
         device_memory: Peak GPU memory of tensors so far, in bytes; None on a CPU.
         evaluated: Scales that the step has evaluated.
         pixels: Pixels that this rank has passed through the network.
@@ -115,7 +114,6 @@ class StepRecord:
     terms: dict[int, LossTerms]
     parts: dict[str, float]
     memory: int
-    sent: dict[str, int] = field(default_factory=dict)
     device_memory: int | None = None
     evaluated: tuple[int, ...] = ()
     pixels: int = 0

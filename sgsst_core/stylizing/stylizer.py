@@ -26,7 +26,7 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
-from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
+from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.rasterizer import make_rasterizer
@@ -321,7 +321,6 @@ class _QueuedStep:
         pixels: Pixels that this rank passes through the network.
         values: Largest magnitude in the gradient, then the values of the results; in host memory, valid after `copied`.
         copied: Event after the copy of `values`; None if there is nothing to wait for.
-        sent: Bytes that had been sent before the step.
     """
 
     step: int
@@ -332,7 +331,6 @@ class _QueuedStep:
     values: Tensor
     copied: torch.cuda.Event | None
     timer: Timer
-    sent: dict[Traffic, int]
 
     def largest(self) -> float:
         """Wait for the device, and return the largest magnitude in the gradient."""
@@ -485,14 +483,13 @@ class Stylizer:
         self._stylized = None
         self.job.timer.clear()
         self._cache_visited()
-        sent = dict(self.job.collectives.sent)
         phase = self.phase
         self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
         before = self._queued
-        self._queue(views, phase, sent)
+        self._queue(views, phase)
         if self.job.plan.precision == "float16" and self._queued is not None and is_too_large(self._queued.largest()):
             self.job = in_bfloat16(self.job, self.step + 1)  # colors and moments are unchanged
-            self._queue(views, phase, sent)
+            self._queue(views, phase)
         self.step += 1
         self.seconds += time.perf_counter() - started
         if before is not None:
@@ -515,7 +512,6 @@ class Stylizer:
         for name, seconds in parts.items():
             self.seconds_by_part[name] = self.seconds_by_part.get(name, 0.0) + seconds
         self.seconds += time.perf_counter() - started
-        every = self.job.collectives.sent
         record = StepRecord(
             step=queued.step,
             stage=queued.phase.stage,
@@ -525,14 +521,13 @@ class Stylizer:
             terms=terms,
             parts=parts,
             memory=psutil.Process().memory_info().rss,
-            sent={kind: total - queued.sent[kind] for kind, total in every.items() if total > queued.sent[kind]},
             device_memory=device_peak(self.job.network.device),
             evaluated=tuple(evaluated),
             pixels=queued.pixels,
         )
         self.history.append(record)
 
-    def _queue(self, views: list[int], phase: Phase, sent: dict[Traffic, int]) -> None:
+    def _queue(self, views: list[int], phase: Phase) -> None:
         """Queue a step."""
         gradient, results, pixels = with_second_attempt(self.job, lambda: self._mean_gradient(views, phase))
         with self.job.timer("optimizer"):
@@ -547,7 +542,7 @@ class Stylizer:
         values, copied = self._copied(largest, results)
         results = [replace(result, image_gradient=None) for result in results]  # frees the gradients
         timer = self.job.timer.lap()
-        self._queued = _QueuedStep(self.step + 1, phase, views, results, pixels, values, copied, timer, sent)
+        self._queued = _QueuedStep(self.step + 1, phase, views, results, pixels, values, copied, timer)
 
     def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, list[SosResult], int]:
         """Return the mean of dE/dsh_dc [n, 3] over some views, the results of this group's own views, and a cost.

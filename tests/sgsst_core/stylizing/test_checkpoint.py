@@ -43,7 +43,7 @@ def state() -> StylizerState:
         queue=[4, 0, 2],
         history=[
             StepRecord(1, "coarse", 1, 0.1, 3.0, {1: terms[1]}, {"render": 0.1}, 10**10),
-            StepRecord(2, "sos", 3, 0.3, 4.0, terms, {"render": 0.2, "loss": 1 / 3}, 10**9, {"image": 7}),
+            StepRecord(2, "sos", 3, 0.3, 4.0, terms, {"render": 0.2, "loss": 1 / 3}, 10**9),
         ],
         seconds_by_part={"render": 0.1},
         memory=12345,

@@ -344,6 +344,11 @@ def pixels(camera: Camera, seed: int) -> Tensor:
     return torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(seed))
 
 
+def bytes_between(sent: list[dict[Traffic, int]]) -> list[dict[Traffic, int]]:
+    """Return the bytes sent between consecutive readings of a counter, by purpose."""
+    return [{kind: after[kind] - before[kind] for kind in after} for before, after in itertools.pairwise(sent)]
+
+
 def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[str, Any]:
     """Return color gradients [N, 3] of two visits, with exchanges of all values and of shown Gaussians' values only."""
     results: dict[str, Any] = {}
@@ -356,9 +361,7 @@ def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[st
             make = functools.partial(pixels, seed=10 * visit + collectives.rank)
             results[name].append(views.gradient(0, views.window(0, make, 3), colors))
             sent.append(dict(collectives.sent))
-        results[f"bytes {name}"] = [
-            {kind: after[kind] - before[kind] for kind in after} for before, after in itertools.pairwise(sent)
-        ]
+        results[f"bytes {name}"] = bytes_between(sent)
     return results
 
 
