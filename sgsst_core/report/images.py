@@ -59,24 +59,20 @@ _MAX_VIEWS, _VIEW_SIDE, _SHEET_SHAPE, _VIEW_GAUSSIANS = 48, 240, 1.6, 250_000
 
 
 def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
-    """Write a JPEG with the style image and, for each evaluation view, the original above the stylized render."""
+    """Write a JPEG with the style images and, for each evaluation view, the original above the stylized render."""
     views, rasterizer = stylizer.job.views, stylizer.job.views.rasterizer
-    columns = []
+    originals, results = [], []
     with torch.no_grad():
         for index in stylizer.job.evaluation_views:
+            camera = views.cameras[index]
+            name = camera.name if len(camera.name) <= 24 else "…" + camera.name[-23:]
             # Call the rasterizer directly, because only one rank writes the sheet and the other ranks do not render.
-            dcs = (views.scene.sh_dc.to(rasterizer.device), stylizer.shown())
-            renders = [rasterizer.render(views.colors(index, dc), views.cameras[index]) for dc in dcs]
-            columns.append((views.cameras[index].name, [_fitted(to_image(render)) for render in renders]))
-    style = _fitted(_stacked([to_image(image) for style in stylizer.job.styles.all for image in style.images]))
-    second = _LINE + max(images[0].height for _, images in columns) + _LINE
-    cells: list[_Cell] = [(_GAP, _LINE, style, "style")]
-    left = _GAP + style.width + _GAP
-    for name, (original, stylized) in columns:
-        short = name if len(name) <= 24 else "…" + name[-23:]
-        cells += [(left, _LINE, original, f"{short}: original"), (left, second, stylized, "stylized")]
-        left += original.width + _GAP
-    _save(path, cells)
+            before, after = views.scene.sh_dc.to(rasterizer.device), stylizer.shown()
+            original = rasterizer.render(views.colors(index, before), camera)
+            originals.append((f"{name}: original", _fitted(original)))
+            results.append(("stylized", _fitted(rasterizer.render(views.colors(index, after), camera))))
+    styles = [("style", _fitted(image)) for style in stylizer.job.styles.all for image in style.images]
+    _save_grid(path, [[style, *(row or ())] for style, row in zip_longest(styles, (originals, results))])
 
 
 def write_views(
@@ -122,7 +118,11 @@ def small_renders(
 
 def write_grid(path: Path, rows: Sequence[Sequence[tuple[str, Tensor] | None]]) -> None:
     """Write a JPEG with rows of images [H, W, 3] in columns, each with its name above; None leaves a place empty."""
-    grid = [[cell and (cell[0], _fitted(to_image(cell[1]))) for cell in row] for row in rows]
+    _save_grid(path, [[cell and (cell[0], _fitted(cell[1])) for cell in row] for row in rows])
+
+
+def _save_grid(path: Path, grid: Sequence[Sequence[tuple[str, Image.Image] | None]]) -> None:
+    """Write a sheet of rows of images; see `write_grid`."""
     widths = [max((cell[1].width for cell in column if cell), default=0) for column in zip_longest(*grid)]
     lefts = [_GAP, *(_GAP + end for end in accumulate(width + _GAP for width in widths))]
     cells: list[_Cell] = []
@@ -150,22 +150,12 @@ def _save(path: Path, cells: Sequence[_Cell]) -> None:
         sheet.save(temporary, format="JPEG", quality=88)
 
 
-def _stacked(images: Sequence[Image.Image]) -> Image.Image:
-    """Stack images vertically, all at the width of the widest."""
-    width = max(image.width for image in images)
-    fitted = [image.resize((width, max(1, round(image.height * width / image.width)))) for image in images]
-    whole, top = Image.new("RGB", (width, sum(image.height for image in fitted)), PAPER), 0
-    for image in fitted:
-        whole.paste(image, (0, top))
-        top += image.height
-    return whole
-
-
-def _fitted(image: Image.Image) -> Image.Image:
-    """Resize an image to the largest size that fits a cell, enlarging it if needed."""
-    factor = min(_MAX_CELL_WIDTH / image.width, _CELL_HEIGHT / image.height)
-    size = (max(1, round(image.width * factor)), max(1, round(image.height * factor)))
-    return image.resize(size, Image.Resampling.LANCZOS)
+def _fitted(image: Tensor) -> Image.Image:
+    """Return an image [H, W, 3] at the largest size that fits a cell, enlarged if needed."""
+    whole = to_image(image)
+    factor = min(_MAX_CELL_WIDTH / whole.width, _CELL_HEIGHT / whole.height)
+    size = (max(1, round(whole.width * factor)), max(1, round(whole.height * factor)))
+    return whole.resize(size, Image.Resampling.LANCZOS)
 
 
 #: Transition from the unstylized to the stylized scene: a vertical line that moves to the right, or a cross-fade.
