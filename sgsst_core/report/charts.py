@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
@@ -56,7 +55,6 @@ STYLE: dict[Any, Any] = {
 }
 #: Label of the y axis of loss charts.
 RELATIVE_LOSS = "loss, relative to the unstylized scene"
-_PHASE_NAMES = {"coarse": "coarsest scale", "sos": "all scales"}
 #: Size in inches. At this width, text is legible on a phone.
 _SIZE = (5.6, 3.5)
 _TITLE = "Loss, relative to the start"
@@ -85,7 +83,7 @@ class History:
     Attributes:
         x: Elapsed seconds, and number of steps.
         limits: Limits of each x axis.
-        phases: Name of each phase's stage, and slice of its steps.
+        phases: Title and slice of the steps of both phases, which may be empty.
         relative: Loss by scale, relative to the unstylized scene.
         mean_relative: Mean over scales, relative to the unstylized scene; NaN for steps on a single scale.
         round_length: Number of steps in which every view occurs once.
@@ -112,10 +110,7 @@ def history_of(report: dict[str, Any]) -> History:
     x: dict[Against, Floats] = {"seconds": column([record["seconds"] for record in records])}
     x["steps"] = column([record["step"] for record in records])
     starts = {scale: column([(before.get(str(scale)) or {}).get("total")]) for scale in scales}
-    phases: list[tuple[str, slice]] = []
-    for stage, run in groupby(record["stage"] for record in records):
-        start = phases[-1][1].stop if phases else 0
-        phases.append((stage, slice(start, start + len(list(run)))))
+    coarse = sum(record["stage"] == "coarse" for record in records)
     losses = {
         scale: column([record["scales"].get(str(scale), {}).get("total") for record in records]) for scale in scales
     }
@@ -125,7 +120,7 @@ def history_of(report: dict[str, Any]) -> History:
     return History(
         x=x,
         limits={against: log_limits(x[against], X_MARGIN) for against in AGAINST},
-        phases=phases,
+        phases=[("coarsest scale", slice(0, coarse)), ("all scales", slice(coarse, len(records)))],
         relative=relative,
         mean_relative=np.where(several, column([record["relative"] for record in records]), math.nan),
         round_length=round_length(report),
@@ -265,12 +260,13 @@ def draw_points(axes: Axes, x: Floats, values: Floats, **options: Any) -> None:
 
 def _mark_phases(axes: Axes, history: History, against: Against) -> None:
     """Label the first phase above the start of the axes and the second one above the end, with a line between them."""
-    low, high = history.limits[against]
-    for (stage, part), place, side in zip(history.phases, (low, high), ("left", "right"), strict=False):
-        if part.start:
-            axes.axvline(max(float(history.x[against][part.start - 1]), low), color=INK, linewidth=0.8, linestyle=":")
-        name, transform = _PHASE_NAMES.get(stage, stage), axes.get_xaxis_transform()
-        axes.text(place, 1.02, name, transform=transform, ha=side, fontsize=8.5, parse_math=False)
+    low, _ = history.limits[against]
+    for (title, part), side in zip(history.phases, ("left", "right"), strict=True):
+        if part.start < part.stop:
+            axes.set_title(title, loc=side)
+            if part.start:
+                end = max(float(history.x[against][part.start - 1]), low)
+                axes.axvline(end, color=INK, linewidth=0.8, linestyle=":")
 
 
 def set_log_x(axes: Axes, limits: tuple[float, float], label: str) -> None:
