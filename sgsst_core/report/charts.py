@@ -57,7 +57,6 @@ STYLE: dict[Any, Any] = {
 RELATIVE_LOSS = "loss, relative to the unstylized scene"
 #: Size in inches. At this width, text is legible on a phone.
 _SIZE = (5.6, 3.5)
-_TITLE = "Loss, relative to the start"
 
 
 @dataclass(frozen=True)
@@ -308,23 +307,14 @@ def draw_legend(figure: Figure, in_row: int = 3) -> None:
         figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), in_row))
 
 
-@dataclass(frozen=True)
-class PageFigure:
-    """Chart of the page.
+def draw_figure(report: dict[str, Any]) -> tuple[str, dict[Against, bytes]]:
+    """Draw the chart of a report.
 
-    Attributes:
-        svg: SVG image by quantity of the x axis, all of the same size.
+    Returns:
+        Caption, and an SVG image by quantity of the x axis, all of the same size; none if no step was made.
     """
-
-    title: str
-    caption: str
-    svg: dict[Against, bytes]
-
-
-def draw_figure(report: dict[str, Any]) -> PageFigure | None:
-    """Draw the chart of a report; return None if no step was made."""
     if not report["history"]:
-        return None
+        return "", {}
     history = history_of(report)
     losses = column([terms["total"] for record in report["history"] for terms in record["scales"].values()])
     undrawn, caption = int((~_drawable(losses)).sum()), "Loss, divided by that of the unstylized scene."
@@ -338,4 +328,4 @@ def draw_figure(report: dict[str, Any]) -> PageFigure | None:
             file = io.BytesIO()
             figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
             svg[against] = file.getvalue()
-    return PageFigure(_TITLE, caption, svg)
+    return caption, svg

@@ -66,7 +66,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         sheet: Contact sheet as JPEG; None omits it.
         views: Sheet of all views as JPEG; None omits it.
     """
-    figure = draw_figure(report)
+    caption, drawings = draw_figure(report)
     return _ENVIRONMENT.get_template("report.html").render(
         report=report,
         scene=PurePath(report["scene"]["path"]).name,
@@ -76,8 +76,8 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         against=AGAINST,
         bins=BINS,
         round_length=round_length(report),
-        figure=figure,
-        drawings={name: _base64(svg) for name, svg in figure.svg.items()} if figure else {},
+        caption=caption,
+        drawings={name: _base64(svg) for name, svg in drawings.items()},
         tables={name: table(report) for name, table in TABLES.items()},
         parts=_time_split(report),
         everything=_everything(report),
@@ -215,15 +215,17 @@ def _decision_table(report: dict[str, Any]) -> Table:
 def _prediction_table(report: dict[str, Any]) -> Table:
     """Return the plan's predictions beside the measured values."""
     predicted, measured = report["plan"].get("prediction") or {}, report["plan"].get("measured") or {}
-    values: list[tuple[str, Callable[[float | None], str], str]] = [("step on all scales", duration, "seconds")]
-    values.append(("peak memory (upper bound)", byte_count, "peak_bytes"))
-    if predicted.get("measuring"):
-        values.append(("measuring, total", duration, "measuring"))
-    if any(each.get("device_bytes") is not None for each in (predicted, measured)):
-        values.append(("peak memory of the GPU (upper bound)", byte_count, "device_bytes"))
+    values: tuple[tuple[str, Callable[[float | None], str], str], ...] = (
+        ("step on all scales", duration, "seconds"),
+        ("peak memory (upper bound)", byte_count, "peak_bytes"),
+        ("measuring, total", duration, "measuring"),
+        ("peak memory of the GPU (upper bound)", byte_count, "device_bytes"),
+    )
     rows: list[list[str]] = []
     for title, text, name in values:
         before, after = predicted.get(name), measured.get(name)
+        if not before and not after:
+            continue
         ratio = after / before if before and after is not None else None
         rows.append([title, text(before), text(after), number(ratio)])
     return Table(["", "predicted", "measured", "measured / predicted"], rows)
