@@ -239,9 +239,8 @@ def test_optional_resume_starts_without_checkpoint(request_: JobSpec) -> None:
 
 
 def test_temporarily_full_disk_is_a_warning(request_: JobSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sgsst_core.stylizing import checkpoint
-
-    monkeypatch.setattr(checkpoint, "_write", checkpoint._write)  # undone after the test, unlike the fault's own change
+    # Undone after the test, unlike the fault's own change.
+    monkeypatch.setattr("worker.execute.save_checkpoint", save_checkpoint)
     fault = Fault(0, "checkpoint", 2, "full")
     fault.write(request_)
     fault.arm(request_)

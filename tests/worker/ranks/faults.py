@@ -148,12 +148,12 @@ def _fired(request: JobSpec) -> Path:
 
 
 def _places() -> dict[Place, tuple[Any, str]]:
-    from sgsst_core.stylizing import checkpoint
     from sgsst_core.stylizing.views import Views
+    from worker import execute
     from worker.ranks.process_group import ProcessGroupCollectives
 
     return {
         "all_reduce": (ProcessGroupCollectives, "all_reduce"),
-        "checkpoint": (checkpoint, "_write"),
+        "checkpoint": (execute, "save_checkpoint"),
         "render": (Views, "render"),
     }
