@@ -25,11 +25,11 @@ from pathlib import Path
 from sqlalchemy import delete, inspect, select
 from sqlalchemy.engine import URL
 
-from service.files.blobs import BLOBS
 from service.files.objects import ObjectStore
 from service.inputs import CHECKPOINT
 from service.settings import ServiceSettings, read_settings
 from service.store import Store
+from service.store.files import BLOBS
 from service.store.tables import ArtifactRow, BlobRow, JobRow, UploadPartRow
 from sgsst_core.errors import SgsstError
 

@@ -45,13 +45,13 @@ from api.http.schemas import (
 from api.http.sending import ConditionsDep, IfNoneMatch, SentFile, file_answers, names_etag, send_file, send_list
 from api.static_files import exported_viewer
 from service import problems
-from service.files.blobs import BLOBS
 from service.files.objects import media_type
 from service.inputs import RESULT, JobParameters, default_job_name, stored_parameters
 from service.inspection.derived import PAGE, Blend
 from service.problems import JOB_ID, SHA256, LostFileError
 from service.settings import check_weights
 from service.states import JobStatus
+from service.store.files import BLOBS
 from service.store.jobs import Jobs
 from service.store.tables import ArtifactRow, BlobRow, JobRow
 from sgsst_core.files.formats import EXTRA_FORMATS, DownloadName, by_name, listed, result_name

@@ -16,7 +16,6 @@ import os
 import secrets
 import shutil
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -28,17 +27,12 @@ from service import problems
 from service.files.objects import Artifacts, FileCache, ObjectStore, disk_errors
 from service.problems import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
 from service.settings import ServiceSettings
-from service.store.files import InputRows, check_offset
+from service.store.files import BLOBS, UPLOADS, InputRows, check_offset
 from service.store.tables import BlobRow, UploadPartRow, UploadRow
 from sgsst_core.files.atomic import file_digest
 
 _log = logging.getLogger(__name__)
 
-#: Age in seconds at which files without a database row are removed; younger files may not have their row yet.
-ORPHAN_SECONDS = 3600.0
-#: Folders of inputs and of unfinished uploads, in the file store (in the data folder if the file store is local). All
-#: other folders of the file store belong to jobs.
-BLOBS, UPLOADS = "blobs", "uploads"
 #: Minimum number of free inodes, since both requests and the database create files.
 _MIN_FREE_INODES = 1000
 
@@ -154,7 +148,7 @@ class Blobs(ABC):
     def remove(self, locations: Iterable[str]) -> None:
         """Remove the files of blobs whose rows have been deleted.
 
-        If a file cannot be removed now, a later call of `collect` removes it.
+        If a file cannot be removed now, housekeeping removes it.
         """
 
     @abstractmethod
@@ -213,26 +207,11 @@ class Blobs(ABC):
     def discard_upload(self, upload_id: str) -> None:
         """Remove the received bytes of an upload whose database row is gone."""
 
-    def collect(self) -> int:
-        """Remove unused blobs and leftovers of crashes; return the number of removed files."""
+    def collect(self) -> None:
+        """Remove expired uploads and unused blobs."""
         for upload_id in self._inputs.expire_uploads():
             self.discard_upload(upload_id)
-        unused = self._inputs.collect()
-        self.remove(unused)
-        removed = len(unused) + self._collect_orphans()
-        before = time.time() - ORPHAN_SECONDS
-        for path in self.incoming.iterdir():
-            if _older(path, before):
-                if path.is_dir() and not path.is_symlink():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    path.unlink(missing_ok=True)
-                removed += 1
-        return removed
-
-    @abstractmethod
-    def _collect_orphans(self) -> int:
-        """Remove files without database rows, which processes left behind when they died; return their number."""
+        self.remove(self._inputs.collect())
 
 
 class BlobFolder(Blobs):
@@ -316,14 +295,6 @@ class BlobFolder(Blobs):
     def discard_upload(self, upload_id: str) -> None:
         """Remove the upload's file."""
         self.upload_path(upload_id).unlink(missing_ok=True)
-
-    def _collect_orphans(self) -> int:
-        known, before, removed = self._inputs.locations(), time.time() - ORPHAN_SECONDS, 0
-        for path in self._blobs.glob("*/*"):
-            if _older(path, before) and f"{path.parent.name}/{path.name}" not in known:
-                path.unlink(missing_ok=True)
-                removed += 1
-        return removed
 
     def upload_path(self, upload_id: str) -> Path:
         """Return the path of the bytes of an unfinished upload."""
@@ -435,19 +406,6 @@ def flush_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _older(path: Path, before: float) -> bool:
-    try:
-        return path.lstat().st_ctime < before  # ctime also changes when the file is renamed
-    except OSError:
-        return False
-
-
-#: Age in seconds at which objects without a database row are removed; younger objects may not have their row yet.
-REMOTE_ORPHAN_SECONDS = 6 * 3600.0
-#: Interval between searches of the store for objects without a database row, in seconds.
-_SEARCH_SECONDS = 3600.0
-
-
 def open_blobs(settings: ServiceSettings, inputs: InputRows, artifacts: Artifacts) -> Blobs:
     """Return the store of inputs: the data folder if the file store is a local folder, otherwise the file store."""
     if artifacts.local:
@@ -466,7 +424,6 @@ class StoredBlobs(Blobs):
     def __init__(self, settings: ServiceSettings, inputs: InputRows, objects: ObjectStore) -> None:
         super().__init__(settings.folder, inputs, settings.min_free_bytes, objects)
         self._cache = open_cache(settings)
-        self._searched_at = float("-inf")
 
     def ensure_space(self, size: int) -> None:
         """Raise NoSpaceError if `size` more bytes do not fit, even after evicting cached files."""
@@ -602,23 +559,10 @@ class StoredBlobs(Blobs):
         """Remove the upload's objects."""
         self.objects.remove_below(f"{UPLOADS}/{upload_id}")
 
-    # --- housekeeping ----------------------------------------------------------------------------------------------
-
-    def _collect_orphans(self) -> int:
+    def collect(self) -> None:
+        """Remove expired uploads and unused blobs, and evict cached files that were in use."""
+        super().collect()
         self._cache.evict()
-        if time.monotonic() - self._searched_at <= _SEARCH_SECONDS:
-            return 0
-        self._searched_at = time.monotonic()
-        before = time.time() - REMOTE_ORPHAN_SECONDS
-        old = [name for name, changed in self.objects.below(BLOBS).items() if changed < before]
-        known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()
-        orphans = [name for name in old if name not in known]
-        parts = [name for name, changed in self.objects.below(UPLOADS).items() if changed < before]
-        uploads = self._inputs.known_uploads(sorted({name.split("/")[1] for name in parts}))
-        orphans += [name for name in parts if name.split("/")[1] not in uploads]
-        for name in orphans:
-            self.objects.remove(name)
-        return len(orphans) + self.objects.abort_old_parts(before)
 
 
 class _ObjectWriter:

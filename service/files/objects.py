@@ -44,6 +44,9 @@ _CONNECT_SECONDS, _ANSWER_SECONDS, _TRIES = 3.0, 10.0, 4
 _PIECE_BYTES, _PIECES = 16 << 20, 3
 #: Minimum and maximum size of an S3 object part in bytes (the last one may be smaller), and maximum number of parts.
 MIN_PART_BYTES, _MAX_PART_BYTES, _MAX_PARTS = 5 << 20, 5 << 30, 10_000
+#: Age in seconds at which files without a database row are removed, in a local folder and in a remote store; younger
+#: ones may not have their row yet.
+ORPHAN_SECONDS, REMOTE_ORPHAN_SECONDS = 3600.0, 6 * 3600.0
 #: Bytes of an object that are read at a time.
 CHUNK = 1 << 17
 #: Time in seconds for which a verified object is not hashed again unless it changes, and maximum number of objects for
@@ -232,6 +235,11 @@ class ObjectStore:
                 if path.startswith(inside)
             }
 
+    def old(self, folder: str) -> list[str]:
+        """Return the names of all objects in a folder that have a database row by now, or will never have one."""
+        before = time.time() - (ORPHAN_SECONDS if self.local else REMOTE_ORPHAN_SECONDS)
+        return sorted(name for name, changed in self.below(folder).items() if changed < before)
+
     def can_join(self, sizes: list[int]) -> bool:
         """Return whether the server can concatenate objects of these sizes itself, without another upload."""
         fit = all(size >= MIN_PART_BYTES for size in sizes[:-1]) and max(sizes, default=0) <= _MAX_PART_BYTES
@@ -256,19 +264,18 @@ class ObjectStore:
                 raise
             self._files.invalidate_cache()
 
-    def abort_old_parts(self, before: float) -> int:
-        """Abort multipart uploads that were started before `before` and never finished; return their number."""
+    def abort_old_parts(self) -> None:
+        """Abort multipart uploads that were started long ago and never finished."""
         if not self._s3:
-            return 0
+            return
         bucket, _, prefix = self.root.partition("/")
         with self._translated(prefix):
             listing = self._files.call_s3("list_multipart_uploads", Bucket=bucket, Prefix=prefix)
-            old = [entry for entry in listing.get("Uploads", ()) if entry["Initiated"].timestamp() < before]
-            for entry in old:
-                self._files.call_s3(
-                    "abort_multipart_upload", Bucket=bucket, Key=entry["Key"], UploadId=entry["UploadId"]
-                )
-            return len(old)
+            for entry in listing.get("Uploads", ()):
+                if entry["Initiated"].timestamp() < time.time() - REMOTE_ORPHAN_SECONDS:
+                    self._files.call_s3(
+                        "abort_multipart_upload", Bucket=bucket, Key=entry["Key"], UploadId=entry["UploadId"]
+                    )
 
     def ping(self) -> None:
         """Raise OSError or StoreError if the store cannot be reached."""

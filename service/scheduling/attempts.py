@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from service import problems
 from service.deadlines import LEAST_RATE
-from service.files.blobs import BLOBS, Blobs
+from service.files.blobs import Blobs
 from service.files.objects import Artifacts
 from service.inputs import CHECKPOINT, PLAN, RESULT, job_spec, layout, stage, stored_parameters
 from service.inspection.inspector import stored_plan
@@ -44,6 +44,7 @@ from service.scheduling.rank_folder import store_weights
 from service.settings import ServiceSettings
 from service.states import AttemptOutcome, Cause, JobStatus
 from service.store import Store
+from service.store.files import BLOBS
 from service.store.queue import Lease, cause_of
 from service.store.tables import ArtifactRow, BlobRow
 from sgsst_core.errors import SettingsError

@@ -1,7 +1,8 @@
 """Agreement of files and database: periodic housekeeping by dispatchers, and the check and repair by `sgsst fsck`.
 
-Files of failed attempts are swept when their job ends. Stray files come from interrupted attempts that stored another
-file after the job had already ended elsewhere. Both are safe while the service is running.
+Files of failed attempts are swept when their job ends. Orphaned files come from interrupted attempts that stored
+another file after the job had already ended elsewhere, and from processes that died. Both are safe while the service is
+running.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Literal, TypeVar
 from sqlalchemy import Select, delete, exists, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute
 
-from service.files.blobs import BLOBS, ORPHAN_SECONDS, REMOTE_ORPHAN_SECONDS, UPLOADS, Blobs, open_blobs
+from service.files.blobs import Blobs, open_blobs
 from service.files.objects import Artifacts, ObjectStore
 from service.inputs import CHECKPOINT
 from service.problems import NotFoundError
@@ -25,13 +26,15 @@ from service.scheduling.publishing import sweep
 from service.settings import ServiceSettings
 from service.states import UNFINISHED
 from service.store import Store
-from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadPartRow, UploadRow
+from service.store.files import BLOBS, UPLOADS
+from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadRow
 
-#: Interval between searches for stray files, in seconds.
-_STRAY_SEARCH_SECONDS = 3600.0
+#: Interval between searches for orphaned files, in seconds.
+_SEARCH_SECONDS = 3600.0
 #: Maximum number of jobs whose leftover files are removed per round.
 _MAX_SWEEPS = 20
-_JOB_PREFIX = "job_"
+#: Description of a file.
+What = Literal["input", "result", "checkpoint", "upload"]
 
 
 class Housekeeper:
@@ -42,34 +45,39 @@ class Housekeeper:
         self._searched_at = float("-inf")
 
     def clean_up(self) -> None:
-        """Delete what has expired, and from time to time stray files."""
+        """Delete what has expired, and from time to time orphaned files."""
         for job_id in self._store.retention.expire():
             self._artifacts.objects.remove_below(job_id)
         for job_id, epoch in self._store.retention.unswept(_MAX_SWEEPS):
             sweep(self._store, self._artifacts, job_id, epoch)
         self._blobs.collect()
-        if time.monotonic() - self._searched_at > _STRAY_SEARCH_SECONDS:
+        if time.monotonic() - self._searched_at > _SEARCH_SECONDS:
             self._searched_at = time.monotonic()
-            remove_strays(self._store, self._artifacts)
+            for objects, _, name in orphans(self._store, self._artifacts, self._blobs):
+                objects.remove(name)
+            self._blobs.objects.abort_old_parts()
 
 
-def remove_strays(store: Store, artifacts: Artifacts) -> int:
-    """Delete stray files and return their number."""
-    before = time.time() - REMOTE_ORPHAN_SECONDS
-    old: dict[str, list[str]] = {}
-    for name, changed in artifacts.objects.below("").items():
-        job_id = name.partition("/")[0]
-        if job_id.startswith(_JOB_PREFIX) and changed < before:
-            old.setdefault(job_id, []).append(name)
-    removed = 0
-    for job_id, names in old.items():
-        for name in strays_of_job(store, job_id, names):
-            artifacts.objects.remove(name)
-            removed += 1
-    return removed
+def orphans(store: Store, artifacts: Artifacts, blobs: Blobs) -> Iterator[tuple[ObjectStore, What, str]]:
+    """Yield old files that no database row refers to or will refer to, each with its store and what it is.
+
+    Files are listed before rows are read, so that the row of every listed file is already visible.
+    """
+    objects, incoming = blobs.objects, ObjectStore(f"file://{blobs.incoming}")
+    inputs, uploads = objects.old(BLOBS), objects.old(UPLOADS)
+    known = store.inputs.file_names()
+    yield from ((objects, "input", name) for name in inputs if name not in known)
+    yield from ((objects, "upload", name) for name in uploads if name not in known)
+    yield from ((incoming, "upload", name) for name in incoming.old(""))
+    of_jobs: defaultdict[str, list[str]] = defaultdict(list)
+    for name in artifacts.objects.old(""):
+        of_jobs[name.partition("/")[0]].append(name)
+    for job_id, names in of_jobs.items():
+        if job_id.startswith("job_"):
+            yield from ((artifacts.objects, "result", name) for name in _strays_of_job(store, job_id, names))
 
 
-def strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
+def _strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
     """Return the files of a job that no database row refers to or will refer to."""
     try:
         job = store.jobs.get(job_id, None)
@@ -89,7 +97,6 @@ _PAGE, _AT_A_TIME = 500, 4
 QUARANTINE = "quarantine"
 
 Kind = Literal["missing", "damaged", "orphaned"]
-What = Literal["input", "result", "checkpoint", "upload"]
 T = TypeVar("T")
 
 
@@ -151,7 +158,7 @@ class FileCheck:
                     self.checked += 1
                     if finding is not None:
                         yield finding
-        for objects, what, name in self._unknown():
+        for objects, what, name in orphans(self._store, self._artifacts, self._blobs):
             if mend:
                 objects.remove(name)
             yield Fault("orphaned", what, name, mended="deleted" if mend else "")
@@ -267,43 +274,3 @@ class FileCheck:
         if self._objects.local:
             return [part(f"{UPLOADS}/{row.id}.part", row.offset)]
         return [part(each.location, each.size) for each in self._store.inputs.parts(row.id)]
-
-    # --- files that no row refers to -------------------------------------------------------------------------------
-
-    def _unknown(self) -> Iterator[tuple[ObjectStore, What, str]]:
-        """Yield files that no database row refers to or will refer to.
-
-        Files are listed before rows are read, so that the row of every listed file is already visible.
-        """
-        blobs = self._old(self._objects, BLOBS)
-        known = {f"{BLOBS}/{location}" for location in self._store.inputs.locations()}
-        yield from ((self._objects, "input", name) for name in blobs if name not in known)
-        for name in self._old(self._objects, UPLOADS):
-            if self._is_orphaned_part(name):
-                yield self._objects, "upload", name
-        incoming = ObjectStore(f"file://{self._blobs.incoming}")
-        yield from ((incoming, "upload", name) for name in self._old(incoming, ""))
-        yield from self._unknown_results()
-
-    def _is_orphaned_part(self, name: str) -> bool:
-        upload_id = name.split("/")[1].removesuffix(".part")
-        with self._database.reading() as session:
-            row = session.get(UploadRow, upload_id)
-            if row is None or row.sha256 is not None:
-                return True
-            known = UploadPartRow.location == name
-            return not self._objects.local and session.scalar(select(exists().where(known))) is False
-
-    def _unknown_results(self) -> Iterator[tuple[ObjectStore, What, str]]:
-        objects = self._artifacts.objects
-        jobs: defaultdict[str, list[str]] = defaultdict(list)
-        for name in self._old(objects, ""):
-            job_id = name.partition("/")[0]
-            if job_id.startswith("job_"):
-                jobs[job_id].append(name)
-        for job_id, names in jobs.items():
-            yield from ((objects, "result", name) for name in strays_of_job(self._store, job_id, names))
-
-    def _old(self, objects: ObjectStore, folder: str) -> list[str]:
-        before = time.time() - (ORPHAN_SECONDS if objects.local else REMOTE_ORPHAN_SECONDS)
-        return sorted(name for name, changed in objects.below(folder).items() if changed < before)

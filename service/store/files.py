@@ -14,6 +14,9 @@ from service.store.database import Database, idempotency_row, new_id, upsert
 from service.store.keys import IS_RECEIPT, NO_QUOTAS, RECEIPT, Quotas, check_bytes, lock_owner
 from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadPartRow, UploadRow
 
+#: Folders of inputs and of unfinished uploads, in the file store (in the data folder if the file store is local). All
+#: other folders of the file store belong to jobs.
+BLOBS, UPLOADS = "blobs", "uploads"
 #: Lifetime of an unreferenced blob in seconds: the request that uploaded it may not have created its job yet.
 GRACE_SECONDS = 3600.0
 #: Fraction of `GRACE_SECONDS` within which a blob's `touched_at` is not updated again, which saves writes.
@@ -108,10 +111,14 @@ class InputRows:
                 session.delete(row)
             return [row.location for row in rows]
 
-    def locations(self) -> set[str]:
-        """Return the locations of all blobs."""
+    def file_names(self) -> set[str]:
+        """Return the names of the files of all blobs and unfinished uploads, in a data folder and in a file store."""
+        unfinished = select(UploadRow.id).where(UploadRow.sha256.is_(None))
         with self.database.reading() as session:
-            return set(session.scalars(select(BlobRow.location)))
+            names = {f"{BLOBS}/{location}" for location in session.scalars(select(BlobRow.location))}
+            names.update(f"{UPLOADS}/{upload_id}.part" for upload_id in session.scalars(unfinished))
+            names.update(session.scalars(select(UploadPartRow.location)))
+        return names
 
     def create_upload(
         self,
@@ -203,11 +210,6 @@ class InputRows:
         query = select(UploadPartRow).where(UploadPartRow.upload_id == upload_id).order_by(UploadPartRow.start)
         with self.database.reading() as session:
             return list(session.scalars(query))
-
-    def known_uploads(self, upload_ids: Sequence[str]) -> set[str]:
-        """Return those of the given uploads that exist, finished or not."""
-        with self.database.reading() as session:
-            return set(session.scalars(select(UploadRow.id).where(UploadRow.id.in_(upload_ids))))
 
     def finish_upload(self, upload_id: str, sha256: str, seconds: float) -> None:
         """Link an upload to the blob made from its bytes."""

@@ -18,7 +18,6 @@ from api.cli.main import main
 from service.files.blobs import open_blobs
 from service.files.objects import Artifacts, ObjectStore
 from service.inputs import CHECKPOINT
-from service.scheduling import housekeeping as fsck
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
@@ -163,8 +162,8 @@ def test_mend_repairs_all_findings(
     code, findings = run(capsys)
     assert (code, kinds(findings)) == (MISSING + DAMAGED, expected), "orphans may still get their rows"
     assert findings[scene]["holders"] == [f"job:{lease.job_id}"]
-    monkeypatch.setattr(fsck, "ORPHAN_SECONDS", -HOUR)
-    monkeypatch.setattr(fsck, "REMOTE_ORPHAN_SECONDS", -HOUR)
+    monkeypatch.setattr("service.files.objects.ORPHAN_SECONDS", -HOUR)
+    monkeypatch.setattr("service.files.objects.REMOTE_ORPHAN_SECONDS", -HOUR)
     expected |= dict.fromkeys(orphans, "orphaned")
     code, findings = run(capsys, "--mend")
     assert (code, kinds(findings)) == (MISSING + DAMAGED + ORPHANED, expected)

@@ -23,7 +23,9 @@ from api.cli.main import main
 from api.cli.options import kind_of
 from api.cli.supervisor import ServeError, serve
 from service.files.blobs import BlobFolder
+from service.files.objects import Artifacts
 from service.inputs import JobParameters
+from service.scheduling.housekeeping import Housekeeper
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -458,15 +460,14 @@ def test_reachable_service_without_keys_does_not_start(tmp_path: Path) -> None:
 
 def test_partial_files_of_dead_process_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = open_store(ServiceSettings(data=tmp_path))
-    blobs = BlobFolder(tmp_path, store.inputs, 0)
+    blobs, artifacts = BlobFolder(tmp_path, store.inputs, 0), Artifacts(f"file://{tmp_path / 'artifacts'}")
     half = blobs.incoming / "half.part"
     half.write_bytes(b"x")
-    blobs.collect()
+    Housekeeper(store, artifacts, blobs).clean_up()
     assert half.exists(), "it may still be written to"
-    monkeypatch.setattr(
-        "service.files.blobs.ORPHAN_SECONDS", -1.0
-    )  # no file's age can be made up: it is that of its name
-    blobs.collect()
+    # no file's age can be made up: it is that of its name
+    monkeypatch.setattr("service.files.objects.ORPHAN_SECONDS", -1.0)
+    Housekeeper(store, artifacts, blobs).clean_up()
     assert not half.exists()
     store.close()
 

@@ -237,7 +237,7 @@ def test_new_job_uses_inputs_of_an_earlier_one(
     service: Service, store: Store, client: httpx2.Client, paths: dict[str, Path]
 ) -> None:
     first = submit(client, paths, ["one.png", "two.png"])
-    used, blobs = client.get(f"/v1/jobs/{first}").json()["inputs"], store.inputs.locations()
+    used, blobs = client.get(f"/v1/jobs/{first}").json()["inputs"], store.inputs.file_names()
     at = f"/v1/jobs/{first}/inputs"
     body = {"scene": f"{at}/scene", "cameras": [f"{at}/cameras:0"], "style": [f"{at}/style:1", f"{at}/style"]}
     answer = client.post("/v1/jobs", json=body | {"parameters": {"style_weights": [3, 1]}})
@@ -250,7 +250,7 @@ def test_new_job_uses_inputs_of_an_earlier_one(
     style = ("style", (paths["style"].name, paths["style"].read_bytes()))
     mixed = client.post("/v1/jobs", files=[*form, style])
     assert mixed.status_code == 202, mixed.text
-    assert store.inputs.locations() >= blobs
+    assert store.inputs.file_names() >= blobs
     assert [each["sha256"] for each in mixed.json()["inputs"] if each["role"] == "scene"] == [used[0]["sha256"]]
     store.jobs.cancel(first, None)
     client.delete(f"/v1/jobs/{first}")

@@ -15,10 +15,10 @@ import httpx2
 import pytest
 
 from service import problems
-from service.files import blobs as stored_blobs
 from service.files.blobs import BlobFolder, Receiver, StoredBlobs, write_all
 from service.files.objects import Artifacts, ObjectStore
 from service.problems import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
+from service.scheduling.housekeeping import Housekeeper
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.files import InputRows
@@ -162,11 +162,11 @@ def test_unused_blobs_are_collected(fleet: Fleet, monkeypatch: pytest.MonkeyPatc
     sha256 = fleet.take(host, b"wanted by nobody")
     fleet.objects.put(_file(fleet.folder, b"x"), "blobs/aa/orphan")
     fleet.objects.put(_file(fleet.folder, b"x"), "uploads/upl_1/orphan")
-    host.collect()
+    Housekeeper(fleet.store, Artifacts(fleet.url), host).clean_up()
     assert len(fleet.names()) == 3, "the rows may still be on their way"
-    monkeypatch.setattr(stored_blobs, "REMOTE_ORPHAN_SECONDS", -HOUR)
+    monkeypatch.setattr("service.files.objects.REMOTE_ORPHAN_SECONDS", -HOUR)
     fleet.store.inputs.database.clock = lambda: 10**11
-    fleet.host("two").collect()
+    Housekeeper(fleet.store, Artifacts(fleet.url), fleet.host("two")).clean_up()
     assert fleet.names() == []
     with pytest.raises(NotFoundError):
         fleet.store.inputs.hold([sha256])

@@ -16,9 +16,9 @@ from service.files.blobs import BlobFolder
 from service.files.objects import Artifacts
 from service.health import dispatcher_is_healthy
 from service.prepare import main as prepare
-from service.scheduling import housekeeping
 from service.scheduling.capacity import Grant, Machine, is_dead, own_name
 from service.scheduling.dispatcher import Dispatcher
+from service.scheduling.housekeeping import orphans
 from service.settings import ServiceSettings
 from service.states import Published
 from service.store import Store, open_store
@@ -234,9 +234,10 @@ def test_prepare_creates_the_tables_once(tmp_path: Path, monkeypatch: pytest.Mon
     assert prepare() == 1
 
 
-def test_stray_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_orphaned_results_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = ServiceSettings(data=tmp_path / "data")
     store, artifacts = open_store(settings), Artifacts(settings.artifacts_url)
+    blobs = BlobFolder(settings.folder, store.inputs, 0)
     store.inputs.add_blob(SHA, "aa/blob", 3)
     source = tmp_path / "file"
     source.write_bytes(b"x")
@@ -253,8 +254,10 @@ def test_stray_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     before, own = put(running.job_id, 1), put(running.job_id, 2)
     everything = {file.location for file in (referenced, late, unknown, before, own)}
     assert set(artifacts.objects.below("")) == everything
-    assert housekeeping.remove_strays(store, artifacts) == 0, "rows may still be on their way"
-    monkeypatch.setattr(housekeeping, "REMOTE_ORPHAN_SECONDS", -60.0)
-    assert housekeeping.remove_strays(store, artifacts) == 3
+    assert list(orphans(store, artifacts, blobs)) == [], "rows may still be on their way"
+    monkeypatch.setattr("service.files.objects.ORPHAN_SECONDS", -60.0)
+    for objects, what, name in orphans(store, artifacts, blobs):
+        assert what == "result"
+        objects.remove(name)
     assert set(artifacts.objects.below("")) == {referenced.location, own.location}
     store.close()

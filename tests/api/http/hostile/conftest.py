@@ -120,6 +120,6 @@ def tidy(service: Service, client: httpx2.Client, store: Store) -> Iterator[None
     assert client.get("/readyz").status_code == 200
     metrics = client.get("/metrics").text
     assert not re.findall(r'sgsst_requests_total\{[^}]*status="(?!503)5\d\d"\} [1-9]', metrics)
-    known = store.inputs.locations()
-    files = {f"{path.parent.name}/{path.name}" for path in (service.data / "blobs").glob("*/*")}
+    known = {name for name in store.inputs.file_names() if name.startswith("blobs/")}
+    files = {path.relative_to(service.data).as_posix() for path in (service.data / "blobs").glob("*/*")}
     assert files == known
