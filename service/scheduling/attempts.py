@@ -24,15 +24,14 @@ from service import problems
 from service.deadlines import LEAST_RATE
 from service.files.blobs import Blobs
 from service.files.objects import Artifacts
-from service.inputs import CHECKPOINT, PLAN, RESULT, job_spec, layout, stage, stored_parameters
+from service.inputs import CHECKPOINT, PLAN, job_spec, layout, stage, stored_parameters
 from service.inspection.inspector import stored_plan
-from service.problems import DamagedFileError, LeaseLostError, LostFileError, ServiceError, StoreError
+from service.problems import LeaseLostError, ServiceError, StoreError
 from service.scheduling.capacity import Grant
 from service.scheduling.messages import (
     Ending,
     Report,
     StopRequest,
-    StoredFile,
     StoreWorkplace,
     Task,
     attempt_ending,
@@ -40,9 +39,9 @@ from service.scheduling.messages import (
     outage,
 )
 from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
-from service.scheduling.rank_folder import store_weights
+from service.scheduling.rank_folder import fetch_checkpoint, store_weights
 from service.settings import ServiceSettings
-from service.states import AttemptOutcome, Cause, JobStatus
+from service.states import AttemptOutcome, Cause, JobStatus, Published
 from service.store import Store
 from service.store.files import BLOBS
 from service.store.queue import Lease, cause_of
@@ -172,11 +171,7 @@ class Stager:
     def _stage(self, folder: Path, lease: Lease, checkpoint: ArtifactRow | None) -> None:
         """Stage the job's files in the attempt's folder."""
         if checkpoint is not None:
-            target = folder / "out" / f"{Path(RESULT).stem}.checkpoint.safetensors"
-            try:
-                self._artifacts.fetch(checkpoint.location, target, checkpoint.sha256)
-            except (LostFileError, DamagedFileError) as error:
-                _log.warning("checkpoint not usable, job restarts: %s", error, extra=lease.log_fields)
+            fetch_checkpoint(self._artifacts, checkpoint, folder / "out")
         job = lease.job
         stage(folder, job.inputs, self._blobs.fetch(self._input_rows(lease), folder))
         (folder / PLAN).symlink_to(
@@ -189,9 +184,12 @@ class Stager:
     def _workplace(self, lease: Lease, checkpoint: ArtifactRow | None) -> StoreWorkplace:
         """Return the description that ranks on other machines need to stage the job's files."""
         files = [
-            StoredFile(f"{BLOBS}/{row.location}", row.sha256, row.size) for row in self._input_rows(lease).values()
+            Published(sha256, f"{BLOBS}/{row.location}", row.size, sha256)
+            for sha256, row in self._input_rows(lease).items()
         ]
-        saved = StoredFile(checkpoint.location, checkpoint.sha256, checkpoint.size) if checkpoint is not None else None
+        saved = None
+        if checkpoint is not None:
+            saved = Published(CHECKPOINT, checkpoint.location, checkpoint.size, checkpoint.sha256)
         objects, weights = self._artifacts.objects, store_weights(self._artifacts.objects)
         return StoreWorkplace(
             objects.url, lease.job_id, lease.epoch, tuple(lease.job.inputs), tuple(files), saved, weights

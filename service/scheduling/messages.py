@@ -25,32 +25,24 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class StoredFile:
-    """File in the store."""
-
-    name: str
-    sha256: str
-    size: int
-
-
-@dataclass(frozen=True)
 class StoreWorkplace:
     """Description of a job's files for its ranks.
 
     Attributes:
         job_id, epoch: Prefix of the job's stored files.
         inputs: `role`, `name`, `sha256` and `size` of each input, for `stage`.
+        files: Contents of the inputs.
         checkpoint: Checkpoint to resume from; None for none.
-        weights: Feature network weights by file name; empty to use the machine's own.
+        weights: Feature network weights; empty to use the machine's own.
     """
 
     url: str
     job_id: str
     epoch: int
     inputs: tuple[dict[str, Any], ...]
-    files: tuple[StoredFile, ...]
-    checkpoint: StoredFile | None
-    weights: dict[str, StoredFile]
+    files: tuple[Published, ...]
+    checkpoint: Published | None
+    weights: tuple[Published, ...]
 
     @property
     def scene_bytes(self) -> int:
@@ -76,9 +68,7 @@ class StoreWorkplace:
     def after(self, stored: Sequence[Published]) -> StoreWorkplace:
         """Return a copy whose checkpoint is the last one among these files."""
         saved = [file for file in stored if file.name == CHECKPOINT]
-        if not saved:
-            return self
-        return replace(self, checkpoint=StoredFile(saved[-1].location, saved[-1].sha256, saved[-1].size))
+        return replace(self, checkpoint=saved[-1]) if saved else self
 
     def tidy(self) -> None:
         """Remove folders of dead ranks on this machine."""

@@ -27,10 +27,11 @@ from service.files.blobs import open_cache
 from service.files.objects import Artifacts, ObjectStore
 from service.inputs import RESULT, stage
 from service.problems import DamagedFileError, LostFileError, ServiceError
-from service.scheduling.messages import StoredFile, StoreWorkplace
+from service.scheduling.messages import StoreWorkplace
 from service.scheduling.publishing import Outbox, put_patiently
 from service.settings import ServiceSettings, keep_private, read_settings
 from service.states import Published
+from service.store.tables import ArtifactRow
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.atomic import file_digest
@@ -75,26 +76,26 @@ class RankFolder:
             self._uploader = _Uploader(outbox, stored)
 
     def _stage(self, workplace: StoreWorkplace, settings: ServiceSettings, rank: int) -> None:
-        cache, objects = open_cache(settings), ObjectStore(workplace.url)
+        cache, artifacts = open_cache(settings), Artifacts(workplace.url)
         files, weights, out = self._root / "files", self._root / "weights", self.folder / "out"
         for path in (files, weights, out):
             path.mkdir(parents=True)
 
-        def link(file: StoredFile, target: Path) -> Path:
-            cache.link(file.sha256, file.size, target, partial(objects.get, file.name))
+        def link(file: Published, target: Path) -> Path:
+            cache.link(file.sha256, file.size, target, partial(artifacts.objects.get, file.location))
             return target
 
         blobs = {file.sha256: link(file, files / file.sha256) for file in workplace.files}
         stage(self.folder, workplace.inputs, blobs)
         try:
-            for name, file in workplace.weights.items():
-                link(file, weights / name)
+            for file in workplace.weights:
+                link(file, weights / file.name)
         except (LostFileError, DamagedFileError) as error:  # not the user's fault, and the user cannot send it again
             raise problems.STORE_UNAVAILABLE("The network's weights in the store of files cannot be used.") from error
         if workplace.weights:
             os.environ["SGSST_CACHE"] = str(weights)
         if workplace.checkpoint is not None and rank == 0:
-            _fetch_checkpoint(objects, workplace.checkpoint, out / f"{Path(RESULT).stem}.checkpoint.safetensors")
+            fetch_checkpoint(artifacts, workplace.checkpoint, out)
 
     def finish(self, *, done: bool) -> None:
         """Upload the remaining files: a checkpoint, or the results.
@@ -159,21 +160,29 @@ class _Uploader:
             self._thread.join()
 
 
-def store_weights(objects: ObjectStore) -> dict[str, StoredFile]:
-    """Upload this machine's installed weights unless they are stored already; return them by file name.
+def fetch_checkpoint(artifacts: Artifacts, checkpoint: ArtifactRow | Published, out: Path) -> None:
+    """Fetch a checkpoint into the folder of outputs; if it is lost or damaged, the job starts from the first step."""
+    try:
+        artifacts.fetch(checkpoint.location, out / f"{Path(RESULT).stem}.checkpoint.safetensors", checkpoint.sha256)
+    except (LostFileError, DamagedFileError) as error:
+        _log.warning("checkpoint not usable, job restarts: name=%s: %s", checkpoint.location, error)
+
+
+def store_weights(objects: ObjectStore) -> tuple[Published, ...]:
+    """Upload this machine's installed weights unless they are stored already, and return them.
 
     Raises:
         StoreError: If the store cannot be reached.
     """
-    weights = {}
+    weights = []
     for path in sorted(cache_folder().glob("*.safetensors")):
         status = path.stat()
         sha256 = _digest(path, status.st_size, status.st_mtime_ns)
-        file = StoredFile(f"{_WEIGHTS_FOLDER}/{sha256}", sha256, status.st_size)
-        if objects.size(file.name) < 0:
-            objects.put(path, file.name)
-        weights[path.name] = file
-    return weights
+        location = f"{_WEIGHTS_FOLDER}/{sha256}"
+        if objects.size(location) < 0:
+            objects.put(path, location)
+        weights.append(Published(path.name, location, status.st_size, sha256))
+    return tuple(weights)
 
 
 @lru_cache
@@ -227,16 +236,3 @@ def _locked(path: Path) -> Any:
     with path.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
-
-
-def _fetch_checkpoint(objects: ObjectStore, checkpoint: StoredFile, target: Path) -> None:
-    """Fetch a checkpoint; if it is missing or damaged, the job starts from the first step."""
-    try:
-        objects.get(checkpoint.name, target)
-    except FileNotFoundError:
-        target.unlink(missing_ok=True)
-        _log.warning("checkpoint missing, job restarts: name=%s", checkpoint.name)
-        return
-    if file_digest(target) != checkpoint.sha256:
-        target.unlink()
-        _log.error("checkpoint damaged, job restarts: name=%s", checkpoint.name)

@@ -21,7 +21,7 @@ from service.files.objects import Artifacts
 from service.inputs import CHECKPOINT
 from service.problems import LostFileError, StoreError
 from service.scheduling import publishing, rank_folder
-from service.scheduling.messages import StoredFile, StoreWorkplace
+from service.scheduling.messages import StoreWorkplace
 from service.states import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.network_weights import load_network_weights
@@ -59,11 +59,11 @@ class Recorder:
         return {file.name for file in self.files}
 
 
-def put(url: str, name: str, data: bytes, folder: Path) -> StoredFile:
+def put(url: str, name: str, data: bytes, folder: Path) -> Published:
     path = folder / os.urandom(4).hex()
     path.write_bytes(data)
     Artifacts(url).objects.put(path, name)
-    return StoredFile(name, file_digest(path), len(data))
+    return Published(name, name, len(data), file_digest(path))
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def job(s3: FaultyS3, tmp_path: Path) -> StoreWorkplace:
     files = {role: put(url, f"blobs/{role}", data, tmp_path) for role, data in contents.items()}
     names = {"scene": "my.ply", "style": "style.png", "cameras": "cameras.json"}
     inputs = tuple({"role": role, "name": names[role], "sha256": file.sha256} for role, file in files.items())
-    return StoreWorkplace(url, "job_1", 3, inputs, tuple(files.values()), None, {})
+    return StoreWorkplace(url, "job_1", 3, inputs, tuple(files.values()), None, ())
 
 
 def checkpoint(folder: Path, step: int) -> None:
@@ -179,7 +179,7 @@ def test_no_file_is_lost_during_a_store_outage(s3: FaultyS3, job: StoreWorkplace
 def test_staging_failures_are_infrastructure_errors(
     s3: FaultyS3, job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    missing = replace(job, files=(*job.files[:2], StoredFile("blobs/none", "e" * 64, 3)))
+    missing = replace(job, files=(*job.files[:2], Published("none", "blobs/none", 3, "e" * 64)))
     with pytest.raises(LostFileError) as lost:
         missing.open(1, Recorder())
     assert pickle.loads(pickle.dumps(lost.value)).code == "file-lost", "it travels from rank to dispatcher"
@@ -200,7 +200,7 @@ def test_weights_are_fetched_by_digest(
     monkeypatch.setenv("SGSST_CACHE", str(tiny_cache))
     expected = load_network_weights("vgg16").sha256
     weights = rank_folder.store_weights(Artifacts(job.url).objects)
-    assert "vgg16.safetensors" in weights
+    assert "vgg16.safetensors" in [file.name for file in weights]
     assert rank_folder.store_weights(Artifacts(job.url).objects) == weights
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "nothing is installed here"))
     rank = replace(job, weights=weights).open(1, Recorder())
