@@ -419,7 +419,7 @@ class WorkRequest(BaseModel):
 
     Attributes:
         work: Kind of work, from `process.WORK`.
-        staged: Paths of the files, relative to the folder; the scene is the job's result for work on that.
+        staged: Paths of the files, relative to the folder, which for work on the job's result also has that (`RESULT`).
         seconds: Limit of CPU time in seconds.
         memory: Memory limit in bytes for reading.
         limits: Limits of the service for a job's inputs; empty for work on results.

@@ -9,8 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,7 +22,6 @@ from service.files.objects import Artifacts
 from service.inputs import RESULT, Staged, WorkRequest, stage, stored_parameters
 from service.inspection.inspector import (
     MEMORY_PER_BYTE,
-    InspectionProcess,
     Kind,
     Processes,
     Show,
@@ -40,23 +38,22 @@ from sgsst_core.files.formats import result_name
 from sgsst_core.files.formats.scene_format import SceneFormat
 from worker.options import DEFAULT_SIDE, JobVideo, Viewpoints
 
-#: Additional CPU seconds per byte of results, for reading, sorting, compressing, and rendering them several times.
-#: Actual use is less than a fifth.
+#: Additional CPU seconds per byte of scene and results, for reading, sorting, compressing, and rendering them several
+#: times. Actual use is less than a fifth.
 _SECONDS_PER_BYTE = 600 / 1e9
-#: Additional bytes of a derived file, for headers.
-_HEADER_BYTES = 1 << 20
-#: Largest size of a blend relative to the result; a PLY with 8-bit values may become one with float32 values.
-_BLEND_SIZE = 4
-#: Largest size of a page relative to the result: geometry and two color sets, in base 85. Then that of a viewpoint's
-#: image in bytes, which is below 3 per pixel even for noise.
-_PAGE_SIZE, _POSTER_BYTES = 2, 3 << 20
+#: Additional bytes of a derived file: headers, the viewer of a page, or the image of a viewpoint, which takes less than
+#: 3 per pixel even for noise.
+_MORE_BYTES = 3 << 20
+#: Largest sizes relative to the result: of a blend, because a PLY with 8-bit values may become one with float32 values,
+#: and of a page with geometry and two color sets in base 85.
+_BLEND_SIZE, _PAGE_SIZE = 4, 2
 #: Maximum number of blends that are stored with a job.
 MOST_BLENDS = 20
 #: Names among a job's artifacts: the HTML page that shows the result, the video, and the image of the page's start.
 PAGE, VIDEO, POSTER = result_name(RESULT, "html"), "video.mp4", "previews/start.jpg"
 #: Limits per frame of a video: CPU seconds per byte of the result and per pixel, of which a fifth is needed, and bytes
-#: of the file per pixel, which H.264 does not reach even for noise. Videos take an eighth of them at most.
-_VIDEO_SECONDS_PER_BYTE, _VIDEO_SECONDS_PER_PIXEL, _VIDEO_BYTES_PER_PIXEL, _USUAL_BYTES = 4e-8, 1e-6, 1.5, 1 / 8
+#: of the file per pixel, which H.264 does not reach even for noise.
+_VIDEO_SECONDS_PER_BYTE, _VIDEO_SECONDS_PER_PIXEL, _VIDEO_BYTES_PER_PIXEL = 4e-8, 1e-6, 1.5
 #: Memory of the encoder, which looks some frames ahead.
 _ENCODER_BYTES = 1 << 30
 _BLENDS = "blends/"
@@ -84,16 +81,42 @@ class Blend:
         return f"{_BLENDS}{Path(RESULT).stem}_{'_'.join(parts)}{self.format.suffix}"
 
 
+@dataclass(frozen=True)
+class _Work:
+    """Work of the inspecting process that makes a file of a job's result.
+
+    Attributes:
+        work: Key of `process.WORK`.
+        name: Name of the file among the job's artifacts.
+        growth: Largest size of the file relative to the result.
+        more: Bytes of the file in addition.
+        options: Values for the inspecting process.
+        others: Ids of other jobs whose results are needed, by the names of their staged files.
+        replaces: Whether the file replaces an earlier one.
+        seconds, memory: CPU seconds and bytes of memory in addition to those for all such work.
+    """
+
+    work: str
+    name: str
+    growth: int = 0
+    more: int = _MORE_BYTES
+    options: dict[str, Any] = field(default_factory=dict)
+    others: dict[str, str] = field(default_factory=dict)
+    replaces: bool = False
+    kind: Kind = "file"
+    seconds: float = 0.0
+    memory: int = 0
+
+
 @dataclass
 class _Making:
     """File that is being made.
 
     Attributes:
-        options: Options on which the file depends besides its name.
         watchers: Callbacks that receive the progress.
     """
 
-    options: JobVideo | dict[str, Any] | None
+    work: _Work
     watchers: list[Show] = field(default_factory=list)
     task: asyncio.Task[None] | None = None
 
@@ -132,10 +155,8 @@ class DerivedFiles:
 
     async def compressed(self, job: JobRow, format: SceneFormat, quotas: Quotas) -> ArtifactRow:
         """Return a job's result in a compressed format; the compression error is stored beside it as JSON."""
-        name = result_name(RESULT, format.name)
-        return await self._existing(job, name) or await self._derived(
-            job, name, lambda: self._compress(job, name, quotas)
-        )
+        work = _Work("compress", result_name(RESULT, format.name), growth=1)
+        return await self._existing(job, work.name) or await self._derived(job, work, quotas)
 
     async def blended(self, job: JobRow, blend: Blend, quotas: Quotas) -> ArtifactRow:
         """Return a blend of a job's scene and results. The owner of the job must also own the others.
@@ -144,9 +165,10 @@ class DerivedFiles:
             INVALID_INPUT: If the results have other Gaussians than the scene.
             TOO_MANY_BLENDS: If the job has `MOST_BLENDS` already.
         """
-        return await self._existing(job, blend.name) or await self._derived(
-            job, blend.name, lambda: self._blend(job, blend, quotas)
-        )
+        others = {f"{job_id}.ply": job_id for job_id in blend.others}
+        parts = {RESULT: blend.weight, **{name: blend.others[job_id] for name, job_id in others.items()}}
+        work = _Work("blend", blend.name, _BLEND_SIZE, options={"parts": parts}, others=others)
+        return await self._existing(job, work.name) or await self._derived(job, work, quotas)
 
     async def page(self, job: JobRow, viewer: dict[str, str], quotas: Quotas) -> ArtifactRow:
         """Return the HTML page that shows a job's result in 3D, beside its scene if both have the same Gaussians.
@@ -155,9 +177,8 @@ class DerivedFiles:
             viewer: Sources of the page; see `worker.derived`.
         """
         options = {"viewer": viewer, "title": job.name, "viewpoints": job.viewpoints or {}}
-        return await self._existing(job, PAGE) or await self._derived(
-            job, PAGE, lambda: self._write_shown(job, "page", PAGE, options, quotas)
-        )
+        work = _Work("page", PAGE, _PAGE_SIZE, options=options, replaces=True)
+        return await self._existing(job, work.name) or await self._derived(job, work, quotas)
 
     async def poster(self, job: JobRow, start: dict[str, Any], quotas: Quotas) -> ArtifactRow:
         """Return the image of a job's result at the viewpoint where its page starts; the left half is unstylized.
@@ -171,10 +192,8 @@ class DerivedFiles:
         row = await self._existing(job, POSTER)
         if row is not None and job.viewpoints and job.viewpoints["start"] == start:
             return row
-        options = {"viewpoint": start}
-        return await self._derived(
-            job, POSTER, lambda: self._write_shown(job, "poster", POSTER, options, quotas), options
-        )
+        work = _Work("poster", POSTER, options={"viewpoint": start}, replaces=True)
+        return await self._derived(job, work, quotas)
 
     async def set_viewpoints(self, job: JobRow, viewpoints: Viewpoints, quotas: Quotas) -> None:
         """Set the viewpoints of the page that shows a job's result, once there is an image of its start."""
@@ -197,29 +216,35 @@ class DerivedFiles:
         Raises:
             BUSY: If another video of the job is in progress.
         """
-        return await self._derived(job, VIDEO, lambda: self._render(job, options, quotas), options, show)
+        size = (await asyncio.to_thread(self._result, job.id)).size
+        side = options.resolution or DEFAULT_SIDE
+        pixels = side * side * options.frames * (2 if options.compare else 1)
+        work = _Work(
+            "video",
+            VIDEO,
+            more=round(_VIDEO_BYTES_PER_PIXEL * pixels) + _MORE_BYTES,
+            options={"video": options.model_dump(mode="json")},
+            replaces=True,
+            kind="video",
+            seconds=_VIDEO_SECONDS_PER_PIXEL * pixels + _VIDEO_SECONDS_PER_BYTE * size * options.frames,
+            memory=MEMORY_PER_BYTE * size + _ENCODER_BYTES,
+        )
+        return await self._derived(job, work, quotas, show)
 
     async def _existing(self, job: JobRow, name: str) -> ArtifactRow | None:
         await asyncio.to_thread(self._result, job.id)
         return await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
 
-    async def _derived(
-        self,
-        job: JobRow,
-        name: str,
-        make: Callable[[], Coroutine[Any, Any, None]],
-        options: JobVideo | dict[str, Any] | None = None,
-        show: Show = lambda now: None,
-    ) -> ArtifactRow:
-        """Return the database row of a file after `make` has made it, in a task that later requests share."""
-        key = job.id, name
+    async def _derived(self, job: JobRow, work: _Work, quotas: Quotas, show: Show = lambda now: None) -> ArtifactRow:
+        """Return the database row of a file after it has been made, in a task that later requests share."""
+        key = job.id, work.name
         making = self._making.get(key)
         if making is None:
-            making = self._making[key] = _Making(options)
-            making.task = asyncio.create_task(make())
+            making = self._making[key] = _Making(work)
+            making.task = asyncio.create_task(self._make(job, work, quotas, making.show))
             making.task.add_done_callback(lambda task: self._end(key, task))
-        elif making.options != options:
-            raise problems.BUSY(f"Another {name} of this job is being rendered. Try again when it is done.")
+        elif making.work != work:
+            raise problems.BUSY(f"Another {work.name} of this job is being rendered. Try again when it is done.")
         assert making.task is not None
         making.watchers.append(show)
         try:
@@ -230,7 +255,7 @@ class DerivedFiles:
             raise
         finally:
             making.watchers.remove(show)
-        row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
+        row = await asyncio.to_thread(self._store.jobs.artifact, job.id, work.name)
         if row is None:
             raise problems.NOT_FOUND(f"The results of job {job.id} are gone.")
         return row
@@ -246,141 +271,55 @@ class DerivedFiles:
             raise problems.NO_ARTIFACT(job_id=job_id, name=RESULT)
         return row
 
-    async def _compress(self, job: JobRow, name: str, quotas: Quotas) -> None:
-        """Compress the result, store the files, and make them visible."""
-        async with self._turn("file", job) as (process, folder, result):
-            await self._threads.run(job.owner, self._blobs.ensure_space, 3 * result.size)
-            staged = await self._stage(folder, job, [result])
-            request = self._request(
-                "compress",
-                folder,
-                job,
-                staged.model_copy(update={"scene": Path(RESULT)}),
-                seconds=_SECONDS_PER_BYTE * result.size,
-                memory=MEMORY_PER_BYTE * result.size,
-                output=(name, result.size + _HEADER_BYTES),  # a compressed scene is smaller
-            )
-            loss = json.dumps(findings_of(await process.ask(request)), indent=1) + "\n"
-            loss_file = folder / "loss.json"
-            await self._threads.run(job.owner, loss_file.write_text, loss)
-            files = {f"{name}.json": loss_file, name: folder / name}
-            await self._threads.run(job.owner, self._publish, job, result, files, quotas, size=result.size)
-
-    async def _blend(self, job: JobRow, blend: Blend, quotas: Quotas) -> None:
-        """Blend the results, store the file, and make it visible."""
-        async with self._turn("file", job) as (process, folder, result):
-            artifacts = await asyncio.to_thread(self._store.jobs.artifacts, job.id)
-            if sum(row.name.startswith(_BLENDS) for row in artifacts) >= MOST_BLENDS:
-                raise problems.TOO_MANY_BLENDS(job_id=job.id, limit=MOST_BLENDS)
-            others = [await asyncio.to_thread(self._result, job_id) for job_id in blend.others]
-            scene = await asyncio.to_thread(self._store.jobs.input, job.id, "scene", 0)
-            size = (scene["size"] if scene else 0) + sum(row.size for row in (result, *others))
-            most = _BLEND_SIZE * result.size
-            await self._threads.run(job.owner, self._blobs.ensure_space, size + most)
-            parts = {RESULT: blend.weight, **{_staged_name(job, row): blend.others[row.job_id] for row in others}}
-            request = self._request(
-                "blend",
-                folder,
-                job,
-                await self._stage(folder, job, [result, *others]),
-                seconds=_SECONDS_PER_BYTE * size,
-                memory=MEMORY_PER_BYTE * size,
-                output=(f"blend{blend.format.suffix}", most + _HEADER_BYTES),
-                options={"parts": parts},
-            )
-            findings_of(await process.ask(request))
-            files = {blend.name: folder / request.output_file}
-            await self._threads.run(job.owner, self._publish, job, result, files, quotas, size=most)
-
-    async def _write_shown(self, job: JobRow, work: str, name: str, options: dict[str, Any], quotas: Quotas) -> None:
-        """Write a page or an image of the result, store it, and make it visible."""
-        async with self._turn("file", job) as (process, folder, result):
-            scene = await asyncio.to_thread(self._store.jobs.input, job.id, "scene", 0)
-            size = result.size + (scene["size"] if scene else 0)
-            most = _PAGE_SIZE * result.size + _POSTER_BYTES
-            await self._threads.run(job.owner, self._blobs.ensure_space, size + most)
-            request = self._request(
-                work,
-                folder,
-                job,
-                await self._stage(folder, job, [result]),
-                seconds=_SECONDS_PER_BYTE * size,
-                memory=MEMORY_PER_BYTE * size,
-                output=(work, most),
-                options={"result": RESULT, **options},
-            )
-            findings_of(await process.ask(request))
-            publish = partial(self._publish, replace=True)
-            await self._threads.run(job.owner, publish, job, result, {name: folder / work}, quotas, size=most)
-
-    async def _render(self, job: JobRow, options: JobVideo, quotas: Quotas) -> None:
-        """Render the video, store it and make it visible."""
-        size = (await asyncio.to_thread(self._result, job.id)).size
-        side = options.resolution or DEFAULT_SIDE
-        pixels = side * side * options.frames * (2 if options.compare else 1)
-        most = round(_VIDEO_BYTES_PER_PIXEL * pixels) + _HEADER_BYTES
-        await self._threads.run(job.owner, self._blobs.ensure_space, 2 * size + round(_USUAL_BYTES * most))
-        async with self._turn("video", job) as (process, folder, result):
-            staged = await self._stage(folder, job, [result])
-            request = self._request(
-                "video",
-                folder,
-                job,
-                staged.model_copy(update={"scene": Path(RESULT)}),
-                seconds=_VIDEO_SECONDS_PER_PIXEL * pixels + _VIDEO_SECONDS_PER_BYTE * size * options.frames,
-                memory=2 * MEMORY_PER_BYTE * size + _ENCODER_BYTES,
-                output=(VIDEO, most),
-                options={"video": options.model_dump(mode="json"), "unstylized": str(staged.scene)},
-            )
-            findings_of(await process.ask(request, self._making[job.id, VIDEO].show))
-            publish = partial(self._publish, replace=True)
-            await self._threads.run(job.owner, publish, job, result, {VIDEO: folder / VIDEO}, quotas, size=most)
-
-    @asynccontextmanager
-    async def _turn(self, kind: Kind, job: JobRow) -> AsyncIterator[tuple[InspectionProcess, Path, ArtifactRow]]:
-        """Wait for the owner's turn, and provide the process, an empty folder, and the job's result."""
-        async with self._processes.turn(job.owner, kind) as process:
+    async def _make(self, job: JobRow, work: _Work, quotas: Quotas, show: Show) -> None:
+        """Wait for the owner's turn, let the inspecting process make a file, store it, and make it visible."""
+        run = partial(self._threads.run, job.owner)
+        async with (
+            self._processes.turn(job.owner, work.kind) as process,
+            self._threads.folder(job.owner, self._folder) as folder,
+        ):
             result = await asyncio.to_thread(self._result, job.id)  # the job may have been deleted meanwhile
-            async with self._threads.folder(job.owner, self._folder) as folder:
-                yield process, folder, result
+            results = {RESULT: result}
+            for name, job_id in work.others.items():
+                results[name] = await asyncio.to_thread(self._result, job_id)
+            artifacts = await asyncio.to_thread(self._store.jobs.artifacts, job.id)
+            if work.work == "blend" and sum(row.name.startswith(_BLENDS) for row in artifacts) >= MOST_BLENDS:
+                raise problems.TOO_MANY_BLENDS(job_id=job.id, limit=MOST_BLENDS)
+            scene = await asyncio.to_thread(self._store.jobs.input, job.id, "scene", 0)
+            size = (scene["size"] if scene else 0) + sum(row.size for row in results.values())
+            await run(self._blobs.ensure_space, size + work.growth * result.size)
+            most = work.growth * result.size + work.more
+            request = WorkRequest(
+                work=work.work,
+                folder=folder,
+                staged=await self._stage(folder, job, results),
+                parameters=stored_parameters(job.parameters),
+                seconds=self._settings.inspection_seconds + _SECONDS_PER_BYTE * size + work.seconds,
+                memory=self._settings.inspection_bytes + MEMORY_PER_BYTE * size + work.memory,
+                options=work.options,
+                output=(Path(work.name).name, most),
+            )
+            findings = findings_of(await process.ask(request, show))
+            files = {work.name: folder / request.output_file}
+            if work.work == "compress":
+                files[f"{work.name}.json"] = loss = folder / "loss.json"
+                await run(loss.write_text, json.dumps(findings, indent=1) + "\n")
+            publish = partial(self._publish, replace=work.replaces)
+            await run(publish, job, result, files, quotas, size=most)
 
-    async def _stage(self, folder: Path, job: JobRow, results: Sequence[ArtifactRow]) -> Staged:
-        """Stage the job's inputs, with results beside them."""
+    async def _stage(self, folder: Path, job: JobRow, results: Mapping[str, ArtifactRow]) -> Staged:
+        """Stage the job's inputs, with results beside them, given by their names there."""
         inputs = await asyncio.to_thread(self._store.jobs.inputs, job.id)
 
         def staging() -> Staged:
             rows = self._store.inputs.hold(sorted({entry["sha256"] for entry in inputs}))
             staged = stage(folder, inputs, self._blobs.fetch(rows, folder))
-            for result in results:
-                self._artifacts.fetch(result.location, folder / _staged_name(job, result), result.sha256)
+            for name, result in results.items():
+                self._artifacts.fetch(result.location, folder / name, result.sha256)
             return staged
 
-        size = sum(entry["size"] for entry in inputs) + sum(result.size for result in results)
+        size = sum(entry["size"] for entry in inputs) + sum(result.size for result in results.values())
         return await self._threads.run(job.owner, staging, size=size)
-
-    def _request(
-        self,
-        work: str,
-        folder: Path,
-        job: JobRow,
-        staged: Staged,
-        *,
-        seconds: float,
-        memory: int,
-        output: tuple[str, int],
-        options: dict[str, Any] | None = None,
-    ) -> WorkRequest:
-        """Return a request to the inspecting process, with limits in addition to those of every inspection."""
-        return WorkRequest(
-            work=work,
-            folder=folder,
-            staged=staged,
-            parameters=stored_parameters(job.parameters),
-            seconds=self._settings.inspection_seconds + seconds,
-            memory=self._settings.inspection_bytes + memory,
-            options=options or {},
-            output=output,
-        )
 
     def _publish(
         self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas, *, replace: bool = False
@@ -412,8 +351,3 @@ class DerivedFiles:
                 store.inputs.end_receipt(receipt)
             for location in [file.location for file in put] if unused is None else unused:
                 artifacts.objects.remove(location)
-
-
-def _staged_name(job: JobRow, result: ArtifactRow) -> str:
-    """Return the name of a staged result; those of other jobs are named by the job."""
-    return RESULT if result.job_id == job.id else f"{result.job_id}.ply"

@@ -32,7 +32,7 @@ import torch
 from scipy import ndimage, spatial  # noqa: F401  # before the first fork, for orbits
 
 from service import problems
-from service.inputs import ROLES, JobParameters, Staged, WorkRequest, job_spec
+from service.inputs import RESULT, ROLES, JobParameters, Staged, WorkRequest, job_spec
 from service.inspection.sandbox import confine, installation
 from service.settings import install_command
 from sgsst_core.budget import default_memory_limit
@@ -206,9 +206,8 @@ def _show(now: Progress, send: _Send) -> None:
 def _compress(request: WorkRequest, _send: _Send) -> dict[str, Any]:
     """Compress a result, and return the loss of quality."""
     settings, photos = request.parameters.settings(), request.staged.photos
-    converted = convert(
-        request.source, request.output_file, compare=True, images=photos, settings=settings, in_place=True
-    )
+    result = request.source.model_copy(update={"scene": Path(RESULT)})
+    converted = convert(result, request.output_file, compare=True, images=photos, settings=settings, in_place=True)
     assert converted.loss is not None
     return converted.loss.as_dict()
 
@@ -229,7 +228,7 @@ def _read_both(request: WorkRequest) -> tuple[SceneFile, SceneFile]:
     source = request.source
     axes, _ = choose_axes(source, request.staged.photos)
     original = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
-    stylized = read_scene(Path(request.options["result"]))
+    stylized = read_scene(Path(RESULT))
     return original.rendered(source.render_mode, source.eps2d), stylized.rendered(source.render_mode, source.eps2d)
 
 
@@ -280,16 +279,15 @@ def _video(request: WorkRequest, send: _Send) -> dict[str, Any]:
         raise SettingsError(f"The service cannot encode videos: its operator has to run `{command}`.") from error
     options = JobVideo(**request.options["video"])
     parameters = request.parameters.model_copy(update={"resolution": options.resolution})
-    unstylized = Path(request.options["unstylized"])
-    job = job_spec(request.staged.model_copy(update={"scene": unstylized}), parameters)
-    source = job.source.model_copy(update={"scene": request.staged.scene})
+    job = job_spec(request.staged, parameters)
+    source = job.source.model_copy(update={"scene": Path(RESULT)})
     started = time.monotonic()
 
     def progress(done: int, total: int) -> None:
         left = (time.monotonic() - started) / done * (total - done)
         _show(Progress(stage="video", step=done, total=total, eta_s=left), send)
 
-    compared, background = unstylized if options.compare else None, job.settings.background
+    compared, background = job.source.scene if options.compare else None, job.settings.background
     wanted = VideoRequest(source, request.output_file, options, background, compared, job=job)
     cameras = render_video(wanted, progress, in_place=True)
     return {"width": cameras[0].width, "height": cameras[0].height, "frames": len(cameras)}

@@ -162,7 +162,7 @@ def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
         parameters=JobParameters.model_validate({"background": [1.0, 1.0, 1.0], "orbit": 3, "up": "x"}),
         seconds=0,
         memory=0,
-        options={"result": RESULT, "viewer": exported_viewer(), "title": "wall"},
+        options={"viewer": exported_viewer(), "title": "wall"},
         output=("page.html", 0),
     )
     WORK["page"][0](request, lambda response: None)
@@ -179,7 +179,7 @@ def test_poster_shows_a_viewpoint_before_and_after(tmp_path: Path, monkeypatch: 
     result = replace(wall(), sh_dc=-wall().sh_dc)
     write_scene(Path(RESULT), result)
     camera = read_cameras(file)[2]
-    options = {"result": RESULT, "viewpoint": viewpoint_of(camera).model_dump()}
+    options = {"viewpoint": viewpoint_of(camera).model_dump()}
     request = WorkRequest(
         work="poster",
         folder=tmp_path,
@@ -217,7 +217,7 @@ def test_page_opens_at_its_start_or_at_the_first_camera(
         parameters=JobParameters(),
         seconds=0,
         memory=0,
-        options={"result": RESULT, "viewer": exported_viewer(), "title": "wall", "viewpoints": viewpoints},
+        options={"viewer": exported_viewer(), "title": "wall", "viewpoints": viewpoints},
         output=("page.html", 0),
     )
     WORK["page"][0](request, lambda response: None)
@@ -243,7 +243,7 @@ def test_page_shows_what_a_crop_leaves_upright(tmp_path: Path, monkeypatch: pyte
             parameters=JobParameters.model_validate({"orbit": 3, **parameters}),
             seconds=0,
             memory=0,
-            options={"result": RESULT, "viewer": exported_viewer(), "title": "figures"},
+            options={"viewer": exported_viewer(), "title": "figures"},
             output=("page.html", 0),
         )
         WORK["page"][0](request, lambda response: None)
@@ -274,11 +274,11 @@ def test_video_shows_what_the_crop_of_a_job_leaves(
     request = WorkRequest(
         work="video",
         folder=tmp_path,
-        staged=staged.model_copy(update={"scene": Path(RESULT)}),
+        staged=staged,
         parameters=parameters,
         seconds=0,
         memory=0,
-        options={"video": video.model_dump(), "unstylized": "scene.ply"},
+        options={"video": video.model_dump()},
         output=("video.mp4", 0),
     )
     assert WORK["video"][0](request, lambda response: None)["frames"] == 1
