@@ -79,12 +79,10 @@ class InputRows:
         recent = self.database.clock() - _HOLD_FRACTION * GRACE_SECONDS
         if any(sha256 not in blobs or blobs[sha256].touched_at < recent for sha256 in digests):
             with self.database.writing() as session:
-                now = self.database.clock()
-                for start in range(0, len(digests), 500):
-                    held = BlobRow.sha256.in_(digests[start : start + 500])
-                    # the same lock order as in `release_blobs`
-                    session.execute(select(BlobRow.sha256).where(held).order_by(BlobRow.sha256).with_for_update())
-                    session.execute(update(BlobRow).where(held).values(touched_at=now))
+                held = BlobRow.sha256.in_(digests)
+                # the same lock order as in `release_blobs`
+                session.execute(select(BlobRow.sha256).where(held).order_by(BlobRow.sha256).with_for_update())
+                session.execute(update(BlobRow).where(held).values(touched_at=self.database.clock()))
             blobs = self.blobs(digests)
         missing = next((sha256 for sha256 in digests if sha256 not in blobs), None)
         if missing is not None:
@@ -93,12 +91,9 @@ class InputRows:
 
     def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
         """Return blobs by digest; missing ones are left out."""
-        blobs: dict[str, BlobRow] = {}
         with self.database.reading_rows() as connection:
-            for start in range(0, len(digests), 500):
-                rows = connection.execute(_BLOBS, {"digests": digests[start : start + 500]})
-                blobs |= {row.sha256: BlobRow(**row._mapping) for row in rows}
-        return blobs
+            rows = connection.execute(_BLOBS, {"digests": list(digests)})
+            return {row.sha256: BlobRow(**row._mapping) for row in rows}
 
     def collect(self) -> list[str]:
         """Delete the rows of blobs that have been unused for a while; return their locations for removing the files."""
@@ -174,13 +169,9 @@ class InputRows:
 
     def uploads(self, upload_ids: Sequence[str], owner: str) -> dict[str, UploadRow]:
         """Return uploads of this owner by id; missing and expired ones are left out."""
-        now = self.database.clock()
-        uploads: dict[str, UploadRow] = {}
+        parameters = {"ids": list(upload_ids), "owner": owner, "now": self.database.clock()}
         with self.database.reading_rows() as connection:
-            for start in range(0, len(upload_ids), 500):
-                parameters = {"ids": upload_ids[start : start + 500], "owner": owner, "now": now}
-                uploads |= {row.id: UploadRow(**row._mapping) for row in connection.execute(_UPLOADS, parameters)}
-        return uploads
+            return {row.id: UploadRow(**row._mapping) for row in connection.execute(_UPLOADS, parameters)}
 
     def advance_upload(
         self, upload_id: str, start: int, size: int, seconds: float, location: str | None = None

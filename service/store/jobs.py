@@ -5,8 +5,7 @@ locks in one order, so that no two wait for each other: the owner's limits, uplo
 each job, blobs by digest, counters.
 
 The loss history is thinned as it is written: a point is stored when the job's running time has grown by one percent
-since the previous one, so points are evenly spaced on the logarithmic time axis of loss charts (784 for 25 hours). If a
-job with many attempts has too many, every second one is deleted.
+since the previous one, so points are evenly spaced on the logarithmic time axis of loss charts (784 for 25 hours).
 """
 
 from __future__ import annotations
@@ -169,16 +168,12 @@ def forget(session: Session, job: JobRow) -> list[str]:
 
 #: Ratio of the running times of consecutive points.
 GROWTH = 1.01
-#: Number of points of a job above which every second one is deleted at the start of an attempt.
-MOST_POINTS = 2000
 
 _POINTS = Base.metadata.tables[ProgressPointRow.__tablename__]
 _OF_JOB = _POINTS.c.job_id == bindparam("job_id")
 _OF_ATTEMPT = _POINTS.c.attempt == bindparam("attempt")
 _LAST = select(_POINTS.c.step, _POINTS.c.seconds).where(_OF_JOB, _OF_ATTEMPT).order_by(_POINTS.c.step.desc()).limit(1)
 _ALL = select(_POINTS.c.progress).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
-_STEPS = select(_POINTS.c.attempt, _POINTS.c.step).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
-_COUNT = select(func.count()).where(_OF_JOB)
 
 
 def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
@@ -191,21 +186,10 @@ def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
         return
     attempt, step, seconds = progress["attempt"], progress["step"], progress["seconds"]
     last = session.execute(_LAST, {"job_id": job_id, "attempt": attempt}).one_or_none()
-    if last is None:
-        _halve(session, job_id)
-    elif step <= last.step or seconds < GROWTH * last.seconds:
+    if last is not None and (step <= last.step or seconds < GROWTH * last.seconds):
         return
     values = {"job_id": job_id, "attempt": attempt, "step": step, "seconds": seconds, "progress": progress}
     session.execute(upsert(session)(_POINTS).values(values).on_conflict_do_nothing())
-
-
-def _halve(session: Session, job_id: str) -> None:
-    """Delete every second point of a job that has too many; the first one remains."""
-    if (session.scalar(_COUNT, {"job_id": job_id}) or 0) <= MOST_POINTS:
-        return
-    steps = session.execute(_STEPS, {"job_id": job_id}).all()
-    one = delete(_POINTS).where(_OF_JOB, _OF_ATTEMPT, _POINTS.c.step == bindparam("at"))
-    session.execute(one, [{"job_id": job_id, "attempt": attempt, "at": step} for attempt, step in steps[1::2]])
 
 
 def _points(connection: Connection, job_id: str, current: dict[str, Any] | None, most: int) -> list[dict[str, Any]]:

@@ -311,20 +311,6 @@ def test_loss_history_continues_across_attempts(store: Store, clock: Clock) -> N
         assert connection.execute(select(func.count()).select_from(ProgressPointRow)).scalar() == 0
 
 
-def test_long_loss_history_is_thinned(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.store.jobs.MOST_POINTS", 40)
-    job_id = queue(store)
-    for _ in range(12):
-        held = lease(store)
-        for step in range(1, 21):
-            store.leases.report_progress(held, at_step(step, float(step)))
-        store.leases.release(held)
-    points = store.jobs.loss_history(store.jobs.get(job_id, None), 1000)
-    assert len(points) <= 40 + 20
-    assert (points[0]["attempt"], points[0]["step"]) == (1, 1)
-    assert (points[-1]["attempt"], points[-1]["step"]) == (12, 20)
-
-
 def test_inputs_are_read_in_pieces(store: Store) -> None:
     """Lists have the scene, styles and cameras, and count photos and masks, whose names are read by page."""
     roles = ["photos", "scene", "photos", "style", "mask", "style", "cameras", "photos"]
