@@ -1,5 +1,7 @@
 """Limits of the time that work may take: the deadline of a request, and threads for work on files, which may hang.
 
+In addition, the patience of a starting process with a database or a file store that does not answer yet.
+
 A request ends some time after its last sign of progress, whatever it waits for. The code that serves it extends the
 deadline for large files, and suspends it for work that has a limit of its own; outside of requests, both do nothing.
 
@@ -11,10 +13,12 @@ stays occupied until the file store answers.
 from __future__ import annotations
 
 import asyncio
+import logging
 import tempfile
+import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import AbstractContextManager, asynccontextmanager, contextmanager, nullcontext, suppress
 from contextvars import ContextVar, copy_context
 from functools import partial
 from pathlib import Path
@@ -22,7 +26,12 @@ from typing import Any, TypeVar
 from weakref import WeakValueDictionary
 
 from service import problems
+from service.problems import DatabaseUnavailableError, StoreError
 
+_log = logging.getLogger(__name__)
+
+#: Interval in seconds between attempts of `until_answered`.
+_RETRY_SECONDS = 1.0
 #: Minimum rate of work on files in bytes per second; it adds to the time that work on a file of known size may take.
 LEAST_RATE = 10e6
 
@@ -86,15 +95,10 @@ def extend(size: int) -> None:
         deadline.extend(size)
 
 
-@contextmanager
-def suspended() -> Iterator[None]:
-    """Call `Deadline.suspended` of the current request."""
+def suspended() -> AbstractContextManager[None]:
+    """Return the context of `Deadline.suspended` of the current request."""
     deadline = _current.get()
-    if deadline is None:
-        yield
-        return
-    with deadline.suspended():
-        yield
+    return nullcontext() if deadline is None else deadline.suspended()
 
 
 #: Number of threads, and maximum number per owner. Threads mostly wait for the disk or the network.
@@ -181,3 +185,24 @@ class FileThreads:
 def _release(loop: asyncio.AbstractEventLoop, free: asyncio.Semaphore, _done: Any) -> None:
     with suppress(RuntimeError):  # the event loop has been closed
         loop.call_soon_threadsafe(free.release)
+
+
+def until_answered(function: Callable[[], None], patience: float) -> None:
+    """Call a function, and repeat it while a database server or a file store does not answer.
+
+    Args:
+        patience: Seconds after which its error is raised; services may start before what they need.
+
+    Raises:
+        DatabaseUnavailableError, StoreError: If there is no answer by then.
+    """
+    until = time.monotonic() + patience
+    while True:
+        try:
+            function()
+            return
+        except (DatabaseUnavailableError, StoreError) as error:
+            if time.monotonic() >= until:
+                raise
+            _log.warning("no answer, retrying: %s", error.__cause__ or error)
+            time.sleep(_RETRY_SECONDS)

@@ -8,15 +8,13 @@ until both the database and the file store respond.
 from __future__ import annotations
 
 import sys
-import time
 
+from service.deadlines import until_answered
 from service.files.objects import ObjectStore
 from service.problems import DatabaseUnavailableError, StoreError
 from service.settings import start
 from service.store import open_store
 from sgsst_core.errors import SettingsError
-
-_RETRY_SECONDS = 2.0
 
 
 def main() -> int:
@@ -24,25 +22,11 @@ def main() -> int:
     settings = start()
     try:
         open_store(settings, patience=settings.start_seconds).close()
-        _make_bucket(ObjectStore(settings.artifacts_url), settings.start_seconds)
+        until_answered(ObjectStore(settings.artifacts_url).make_bucket, settings.start_seconds)
     except (DatabaseUnavailableError, StoreError, SettingsError) as error:
         print(f"error: {error}\n{error.__cause__ or ''}", file=sys.stderr)
         return 1
     return 0
-
-
-def _make_bucket(objects: ObjectStore, patience: float) -> None:
-    """Create the bucket, retrying for `patience` seconds while the store does not respond."""
-    until = time.monotonic() + patience
-    while True:
-        try:
-            objects.make_bucket()
-        except StoreError:
-            if time.monotonic() >= until:
-                raise
-            time.sleep(_RETRY_SECONDS)
-        else:
-            return
 
 
 if __name__ == "__main__":

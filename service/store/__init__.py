@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-import time
-
-from service.problems import DatabaseUnavailableError
+from service.deadlines import until_answered
 from service.settings import ServiceSettings
 from service.store.database import ANSWER_SECONDS, Clock, Database
 from service.store.files import InputRows
@@ -13,11 +10,6 @@ from service.store.jobs import Jobs, ShareLinks
 from service.store.keys import Keys, Sessions
 from service.store.operations import Operations, Retention
 from service.store.queue import Leases, RetryPolicy
-
-#: Interval between attempts to connect to an unavailable database, in seconds.
-_RETRY_SECONDS = 1.0
-
-_log = logging.getLogger(__name__)
 
 
 class Store:
@@ -55,14 +47,5 @@ def open_store(
         DatabaseUnavailableError: If the database does not respond.
     """
     store = Store(settings, clock, answer_seconds)
-    until = time.monotonic() + (0.0 if store.database.sqlite else patience)
-    while True:
-        try:
-            store.database.upgrade()
-        except DatabaseUnavailableError as error:
-            if time.monotonic() >= until:
-                raise
-            _log.warning("database unavailable, retrying: %s", error.__cause__ or error)
-            time.sleep(_RETRY_SECONDS)
-        else:
-            return store
+    until_answered(store.database.upgrade, 0.0 if store.database.sqlite else patience)
+    return store
