@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
-from sqlalchemy import Select, delete, exists, select, tuple_
+from sqlalchemy import ColumnElement, Select, and_, delete, exists, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute
 
 from service.files.blobs import Blobs, open_blobs
@@ -121,15 +121,15 @@ class _File:
     """File that a row refers to.
 
     Attributes:
-        is_current: Callback that returns whether the row still refers to the file.
+        row: Condition for the row as long as it refers to the file.
         forget: Callback that deletes the row if possible and returns what happened.
     """
 
     what: What
     objects: ObjectStore
     name: str
+    row: ColumnElement[bool]
     fault: Callable[[], Literal["missing", "damaged"] | None]
-    is_current: Callable[[], bool]
     forget: Callable[[], str]
     holders: Callable[[], tuple[str, ...]]
 
@@ -165,7 +165,7 @@ class FileCheck:
 
     def _examine(self, file: _File, *, mend: bool) -> Fault | None:
         # The second check rules out that a running service has just replaced or removed the file and its row.
-        kind = file.fault() and file.is_current() and file.fault()
+        kind = file.fault() and self._is_current(file) and file.fault()
         if not kind:
             return None
         finding = Fault(kind, file.what, file.name, file.holders())
@@ -177,6 +177,10 @@ class FileCheck:
             file.objects.move(file.name, target)
             done = f"moved to {target}; "
         return replace(finding, mended=done + file.forget())
+
+    def _is_current(self, file: _File) -> bool:
+        with self._database.reading() as session:
+            return bool(session.scalar(select(exists().where(file.row))))
 
     # --- files that rows refer to ----------------------------------------------------------------------------------
 
@@ -203,10 +207,7 @@ class FileCheck:
 
     def _input(self, row: BlobRow) -> _File:
         name = f"{BLOBS}/{row.location}"
-
-        def is_current() -> bool:
-            now = self._store.inputs.blobs([row.sha256]).get(row.sha256)
-            return now is not None and now.location == row.location
+        same = and_(BlobRow.sha256 == row.sha256, BlobRow.location == row.location)
 
         def holders() -> tuple[str, ...]:
             with self._database.reading() as session:
@@ -216,45 +217,33 @@ class FileCheck:
         def forget() -> str:
             used = exists().where(BlobUseRow.sha256 == row.sha256)
             with self._database.writing() as session:
-                deleted = session.execute(
-                    delete(BlobRow).where(BlobRow.sha256 == row.sha256, BlobRow.location == row.location, ~used)
-                )
+                deleted = session.execute(delete(BlobRow).where(same, ~used))
                 return "its row is deleted" if deleted.rowcount else "it comes back when it is sent again"  # type: ignore[attr-defined]
 
-        return _File(
-            "input", self._objects, name, lambda: self._objects.fault(name, row.sha256), is_current, forget, holders
-        )
+        return _File("input", self._objects, name, same, lambda: self._objects.fault(name, row.sha256), forget, holders)
 
     def _result(self, row: ArtifactRow) -> _File:
         objects = self._artifacts.objects
-
-        def is_current() -> bool:
-            now = self._store.jobs.artifact(row.job_id, row.name)
-            return now is not None and now.location == row.location
+        named = and_(ArtifactRow.job_id == row.job_id, ArtifactRow.name == row.name)
+        same = and_(named, ArtifactRow.location == row.location)
 
         def forget() -> str:
-            same = (ArtifactRow.job_id == row.job_id) & (ArtifactRow.name == row.name)
             with self._database.writing() as session:
-                session.execute(delete(ArtifactRow).where(same, ArtifactRow.location == row.location))
+                session.execute(delete(ArtifactRow).where(same))
             return "its row is deleted"
 
         return _File(
             "checkpoint" if row.name == CHECKPOINT else "result",
             objects,
             row.location,
+            same,
             lambda: objects.fault(row.location, row.sha256),
-            is_current,
             forget,
             lambda: (f"job:{row.job_id}",),
         )
 
     def _parts(self, row: UploadRow) -> list[_File]:
         """Return the files that hold the bytes of an unfinished upload."""
-
-        def is_current() -> bool:
-            with self._database.reading() as session:
-                now = session.get(UploadRow, row.id)
-                return now is not None and now.sha256 is None
 
         def forget() -> str:
             self._store.inputs.delete_upload(row.id, row.owner)
@@ -265,8 +254,8 @@ class FileCheck:
                 "upload",
                 self._objects,
                 name,
+                and_(UploadRow.id == row.id, UploadRow.sha256.is_(None)),
                 lambda: None if self._objects.size(name) >= size else "missing",
-                is_current,
                 forget,
                 lambda: (f"upload:{row.id}",),
             )
