@@ -584,7 +584,7 @@ def read_shared_scene(
     homes = collectives.all_gather(home())
     reader = homes.index(home())
     sharing = homes.count(home())
-    _check_memory(path, collectives, sharing, growth)
+    together(collectives, lambda: _check_memory(path, collectives.rank, sharing, growth))
     own: SceneFile | None = None
     error: SgsstError | None = None
     shared: _Shared | None = None
@@ -658,28 +658,22 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
     return replace(shared.file, scene=replace(shared.file.scene, **tensors), retained=retained)
 
 
-def _check_memory(path: Path, collectives: Collectives, sharing: int, growth: float) -> None:
-    """Check that a scene, by the size in its header, fits into the free memory of each rank's machine and GPU.
+def _check_memory(path: Path, rank: int, sharing: int, growth: float) -> None:
+    """Check that a scene, by the size in its header, fits into the free memory of this rank's machine and GPU.
 
     Args:
+        sharing: Number of ranks on this machine.
         growth: Factor of growth; see `read_shared_scene`.
+
+    Raises:
+        SceneError: If the header cannot be read.
+        SceneTooLargeError: If the scene does not fit.
     """
-    problem: SgsstError | None = None
-    try:
-        header = read_scene_header(path)
-        rest = 3 * header.coefficients
-        held = 0 if stays_in_file(header, _held_bytes(growth)) else rest  # in memory
-        sizes = header.count, header.count * 4 * (14 + held), header.count * 4 * (14 + rest)
-        problem = _lack(collectives.rank, sharing, *(int(size * growth) for size in sizes))
-    except SgsstError as error:
-        problem = error
-    for raised in collectives.all_gather(problem):
-        if raised is not None:
-            raise raised
-
-
-def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: int) -> SceneTooLargeError | None:
-    """Return the error if this rank lacks memory; None if the scene fits."""
+    header = read_scene_header(path)
+    rest = 3 * header.coefficients
+    held = 0 if stays_in_file(header, _held_bytes(growth)) else rest  # in memory
+    sizes = header.count, header.count * 4 * (14 + held), header.count * 4 * (14 + rest)
+    count, scene_bytes, device_bytes = (int(size * growth) for size in sizes)
     own = count * (OPTIMIZER_BYTES + VIEW_BYTES)
     each = scene_bytes + own  # every rank has its own copy of the Gaussians that its views show
     where = f"Rank {rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
@@ -687,15 +681,14 @@ def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: i
     needed, free = scene_bytes + sharing * each, container.memory().available
     if needed > free:
         ranks = f"{sharing} ranks share it" if sharing > 1 else "there is one rank"
-        return SceneTooLargeError(
+        raise SceneTooLargeError(
             f"{where} {needed / 1e9:.2f} GB of memory ({ranks}), but {free / 1e9:.2f} GB are free. {advice}"
         )
     if torch.cuda.is_available():
         free, total = torch.cuda.mem_get_info()
         needed = device_bytes + own
         if needed > free:
-            return SceneTooLargeError(
+            raise SceneTooLargeError(
                 f"{where} {needed / 1e9:.2f} GB on its GPU ({torch.cuda.get_device_name()}, {total / 1e9:.1f} GB), but "
                 f"{free / 1e9:.2f} GB are free. {advice}"
             )
-    return None
