@@ -33,55 +33,49 @@ _NICENESS = 5
 _PREVIEWS = Path("out", "previews")
 
 
-class AttemptProcess:
-    """Attempt at a job, inside its own process."""
+def run(task: Task) -> None:
+    """Run the attempt and report how it ended, whatever the reason."""
+    stopping, finishing = threading.Event(), threading.Event()
+    signal.signal(signal.SIGTERM, lambda number, frame: stopping.set())
+    signal.signal(signal.SIGUSR1, lambda number, frame: finishing.set())
+    report_progress(Progress(stage="reading"))
+    try:
+        result = _stylize(task, stopping, finishing)
+    except Exception as error:
+        send(Report(ending=failure(error)))
+        if cause_of_error(error) != Cause.JOB:
+            log(OUTAGE["message"])  # the details are for the operator only
+        else:
+            traceback.print_exc()
+        return
+    if result is not None and result.stopped != "interrupted":
+        send(Report(ending=Ending(AttemptOutcome.SUCCEEDED, result=result)))
 
-    def __init__(self, task: Task) -> None:
-        self._task = task
-        self._stopping, self._finishing = threading.Event(), threading.Event()
 
-    def run(self) -> None:
-        """Run the attempt and report how it ended, whatever the reason."""
-        signal.signal(signal.SIGTERM, lambda number, frame: self._stopping.set())
-        signal.signal(signal.SIGUSR1, lambda number, frame: self._finishing.set())
-        report_progress(Progress(stage="reading"))
-        try:
-            result = self._stylize()
-        except Exception as error:
-            send(Report(ending=failure(error)))
-            if cause_of_error(error) != Cause.JOB:
-                log(OUTAGE["message"])  # the details are for the operator only
-            else:
-                traceback.print_exc()
-            return
-        if result is not None and result.stopped != "interrupted":
-            send(Report(ending=Ending(AttemptOutcome.SUCCEEDED, result=result)))
+def _stylize(task: Task, stopping: threading.Event, finishing: threading.Event) -> Result | None:
+    from worker.ranks.rank import WorkerOptions
+    from worker.run import Listener, stylize
 
-    def _stylize(self) -> Result | None:
-        from worker.ranks.rank import WorkerOptions
-        from worker.run import Listener, stylize
-
-        task = self._task
-        listener = Listener(
-            prepared=report_prepared,
-            progress=report_progress,
-            warn=log,
-            stop=self._stopping.is_set,
-            finish=self._finishing.is_set,
-            happened=log,
-            stored=lambda file: send(Report(stored=file)),
-        )
-        options = WorkerOptions(
-            checkpoint_seconds=task.checkpoint_seconds,
-            preview_folder=_PREVIEWS,
-            preview_seconds=task.preview_seconds,
-            resume_required=False,
-            workplace=task.workplace,
-            plan_file=Path(PLAN),
-            started=process_start(),
-        )
-        workers = task.workers if task.workers > 1 or task.cluster else None
-        return stylize(task.spec, workers, listener, options).result
+    listener = Listener(
+        prepared=report_prepared,
+        progress=report_progress,
+        warn=log,
+        stop=stopping.is_set,
+        finish=finishing.is_set,
+        happened=log,
+        stored=lambda file: send(Report(stored=file)),
+    )
+    options = WorkerOptions(
+        checkpoint_seconds=task.checkpoint_seconds,
+        preview_folder=_PREVIEWS,
+        preview_seconds=task.preview_seconds,
+        resume_required=False,
+        workplace=task.workplace,
+        plan_file=Path(PLAN),
+        started=process_start(),
+    )
+    workers = task.workers if task.workers > 1 or task.cluster else None
+    return stylize(task.spec, workers, listener, options).result
 
 
 def report_progress(now: Progress) -> None:
@@ -136,7 +130,7 @@ def main() -> None:
     _channel = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     os.chdir(sys.argv[1])
-    AttemptProcess(Task.model_validate_json(Path("task.json").read_bytes())).run()
+    run(Task.model_validate_json(Path("task.json").read_bytes()))
 
 
 if __name__ == "__main__":

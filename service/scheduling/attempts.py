@@ -322,7 +322,8 @@ class RunningAttempt:
         except SettingsError as error:
             self._fail({"code": error.code, "message": str(error)}, permanent=True)
             return
-        self._count_gpus()
+        if self.grant.gpus:
+            self._store.leases.hold_gpus(self.lease, len(self.grant.gpus))
         prepare = partial(self._stager.prepare, self._folder, self.lease, self.grant, spec)
         self._within(prepare, size=sum(entry["size"] for entry in self.lease.job.inputs))
         self._process = ChildProcess(self._folder, self.grant, cluster=self._stager.cluster)
@@ -398,11 +399,6 @@ class RunningAttempt:
             self._store.leases.start(self.lease)
         if report.progress is not None:
             self._progress.update(report.progress)
-
-    def _count_gpus(self) -> None:
-        """Record the attempt's GPUs, which are charged to the job's owner."""
-        if self.grant.gpus:
-            self._store.leases.hold_gpus(self.lease, len(self.grant.gpus))
 
     def _kill(self) -> None:
         if self._process is not None:

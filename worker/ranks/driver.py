@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from sgsst_core.errors import ClusterAwayError, InfrastructureError, RanksDriftedError, RanksFailedError, SgsstError
 from worker.job import scene_bytes
@@ -151,7 +151,7 @@ class _Attempts:
             self._relay.pass_on(first.status)
             if self._relay.before_steps and (line := long_wait(self._group)) and line != said:
                 self._listener.happened(said := line)
-            if first.outcome is not None and first.outcome.kind == "done":
+            if first.outcome is not None and first.outcome.error is None:
                 done_at = done_at or time.monotonic()
                 if all(rank.outcome for rank in self._group.handles) or time.monotonic() - done_at > _LAST_WORDS:
                     return first.outcome.result
@@ -479,9 +479,9 @@ def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> 
     silent = max(group.handles, key=lambda rank: rank.silence)
     if silent.silence > rank_timeout:
         raise _silent(group, silent)
-    failed = [rank for rank in group.handles if rank.outcome and rank.outcome.kind == "failed"]
-    if failed:
-        _wait_for_the_reason(group, cluster, failed[0])
+    for rank in group.handles:
+        if rank.outcome is not None and rank.outcome.error is not None:
+            _wait_for_the_reason(group, cluster, rank, rank.outcome.error)
 
 
 #: Seconds of waiting for others before the first step that are reported.
@@ -506,7 +506,7 @@ def long_wait(group: RankGroup) -> str | None:
     )
 
 
-def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle) -> None:
+def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle, error: Exception) -> NoReturn:
     """Wait for the cause of a rank's broken connection and raise it.
 
     A connection breaks when another rank ends, but it takes a moment until the driver knows which one.
@@ -518,9 +518,6 @@ def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle)
     silent = max(group.handles, key=lambda rank: rank.silence)
     if silent.silence > _GRACE:
         raise _silent(group, silent)
-    assert failed.outcome is not None
-    assert failed.outcome.error is not None
-    error = failed.outcome.error
     raise _lost(f"{group.name_of(failed)} lost its connection: {first_line(error)}", error)
 
 
@@ -530,9 +527,8 @@ def _look_for_reasons(group: RankGroup, cluster: Cluster) -> None:
         raise _lost("Ray's own processes on this machine were lost", machine=True)
     for rank in group.handles:
         outcome = rank.outcome
-        if outcome is None or outcome.kind != "failed" or outcome.echo:
+        if outcome is None or outcome.error is None or outcome.echo:
             continue
-        assert outcome.error is not None
         failure = failure_of(outcome.error, group.name_of(rank))
         if failure.kind == "loss" or isinstance(outcome.error, InfrastructureError):
             outcome.error.add_note(f"{group.name_of(rank)}:\n{outcome.trace}")

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from sgsst_core.errors import InfrastructureError
 from worker.options import RunOptions
@@ -158,13 +158,13 @@ class Outcome:
     """Outcome of a rank.
 
     Attributes:
-        kind: "done" or "failed".
+        result: Result of the job; None if it failed.
+        error: Error with which it failed; None for success.
         trace: Text of the error's traceback.
         echo: Whether the error occurred in an exchange between ranks. The root cause may then be the loss of another
             rank.
     """
 
-    kind: Literal["done", "failed"]
     result: Result | None = None
     error: Exception | None = None
     trace: str = ""
@@ -285,7 +285,7 @@ class RankProcess:
                 if place is not None:
                     place.finish(done=result.stopped != "interrupted")
                     self._leave(place)
-                self._update(outcome=Outcome("done", result))
+                self._update(outcome=Outcome(result))
             except BaseException as error:
                 self._update(outcome=_failure(error))
 
@@ -368,7 +368,7 @@ def _failure(error: BaseException) -> Outcome:
         pickle.loads(pickle.dumps(sent))
     except Exception:  # the error cannot be pickled, so only its text is sent
         sent = RuntimeError(f"{type(error).__name__}: {error}")
-    return Outcome("failed", error=sent, trace=trace, echo=_raised_in_exchange(error))
+    return Outcome(error=sent, trace=trace, echo=_raised_in_exchange(error))
 
 
 def _raised_in_exchange(error: BaseException) -> bool:

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -369,9 +369,9 @@ def test_wait_for_another_rank_is_visible(tmp_path: Path) -> None:
     assert on_ranks(2, wait_for_first, tmp_path / "seen") == [False, False]
 
 
-def rank_handle(waiting: float, stage: str | None = None, kind: Literal["failed"] | None = None) -> RankHandle:
+def rank_handle(waiting: float, stage: str | None = None, error: Exception | None = None) -> RankHandle:
     status = RankStatus(
-        waiting=waiting, progress=Progress(stage=stage) if stage else None, outcome=kind and Outcome(kind)
+        waiting=waiting, progress=Progress(stage=stage) if stage else None, outcome=error and Outcome(error=error)
     )
     return RankHandle(None, None, status=status)
 
@@ -385,7 +385,7 @@ def rank_handle(waiting: float, stage: str | None = None, kind: Literal["failed"
             "Worker 0. Still at work: Worker 1 (reading), Worker 2 (planning).",
         ),
         (
-            [rank_handle(LONG_WAIT + 1), rank_handle(0.0, kind="failed"), rank_handle(LONG_WAIT + 9)],
+            [rank_handle(LONG_WAIT + 1), rank_handle(0.0, error=RuntimeError()), rank_handle(LONG_WAIT + 9)],
             "Worker 0, Worker 2. All wait for each other's messages: check the network between their machines.",
         ),
     ],
