@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import re
+import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -118,10 +119,11 @@ class AsyncClient:
         """
         files = _files(scene, style, cameras, photos, masks, painted)
         parameters |= {"painted": [*painted.values()]} if painted else {}
+        fields = await uploads.send_files(self._transport, files, parameters, progress)
         given = {"webhook": webhook, "webhook_events": ",".join(webhook_events)}
-        sent = {name: value for name, value in given.items() if value}
-        created = await uploads.create_job(self._transport, files, parameters, sent, progress)
-        return Job.of(created)
+        fields += [(name, (None, value)) for name, value in given.items() if value]
+        headers = {"Idempotency-Key": secrets.token_hex(16)}
+        return Job.of((await self._transport.call("POST", "/v1/jobs", files=fields, headers=headers)).json())
 
     async def plan(
         self,
@@ -144,7 +146,8 @@ class AsyncClient:
         """
         files = _files(scene, style, cameras, photos, masks, painted)
         parameters |= {"painted": [*painted.values()]} if painted else {}
-        return await uploads.plan_job(self._transport, files, parameters, progress=progress, planning=planning)
+        fields = await uploads.send_files(self._transport, files, parameters, progress)
+        return await self._transport.work("/v1/jobs", "planning", planning, params={"dry_run": True}, files=fields)
 
     async def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> str:
         """Upload a file in parts, and return the upload's id. Any number of jobs may use the upload."""

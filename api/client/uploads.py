@@ -65,26 +65,7 @@ def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
     }
 
 
-async def create_job(
-    transport: Transport, files: JobFiles, parameters: Mapping[str, Any], webhook: Mapping[str, str], progress: Progress
-) -> dict[str, Any]:
-    """Submit a job, and return the service's response; see `AsyncClient.submit`."""
-    fields = await _send_files(transport, files, parameters, progress)
-    fields += [(name, (None, value)) for name, value in webhook.items()]
-    headers = {"Idempotency-Key": secrets.token_hex(16)}
-    created: dict[str, Any] = (await transport.call("POST", "/v1/jobs", files=fields, headers=headers)).json()
-    return created
-
-
-async def plan_job(
-    transport: Transport, files: JobFiles, parameters: Mapping[str, Any], *, progress: Progress, planning: Progress
-) -> dict[str, Any]:
-    """Plan a job without queueing it; see `AsyncClient.plan`."""
-    fields = await _send_files(transport, files, parameters, progress)
-    return await transport.work("/v1/jobs", "planning", planning, params={"dry_run": True}, files=fields)
-
-
-async def _send_files(
+async def send_files(
     transport: Transport, files: JobFiles, parameters: Mapping[str, Any], progress: Progress
 ) -> list[tuple[str, Any]]:
     """Upload the large files, and return the form fields of the request, which contain the small files and the URLs."""

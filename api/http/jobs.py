@@ -9,7 +9,7 @@ import asyncio
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import PurePosixPath
 from typing import Annotated, Any
@@ -45,7 +45,7 @@ from api.http.schemas import (
 from api.http.sending import ConditionsDep, IfNoneMatch, SentFile, file_answers, names_etag, send_file, send_list
 from api.static_files import exported_viewer
 from service import problems
-from service.files.objects import media_type
+from service.files.objects import ObjectStore, media_type
 from service.inputs import RESULT, JobParameters, default_job_name, stored_parameters
 from service.inspection.derived import PAGE, Blend
 from service.problems import JOB_ID, SHA256, LostFileError
@@ -386,24 +386,27 @@ async def get_input(
 
 def input_file(context: Context, owner: str, row: BlobRow, name: str, kind: str) -> SentFile:
     """Return a stored input for sending it under a name, with a media type."""
-    path = f"{BLOBS}/{row.location}"
-    check, read = partial(_check_input, context, row), partial(context.blobs.objects.read, path)
-    return SentFile(owner, row.sha256, row.size, name, kind, check, read, policy=INPUT_POLICY)
+    path, objects = f"{BLOBS}/{row.location}", context.blobs.objects
+    check = partial(_check, objects, path, row.sha256, lambda: row.sha256 in context.store.inputs.blobs([row.sha256]))
+    return SentFile(owner, row.sha256, row.size, name, kind, check, partial(objects.read, path), policy=INPUT_POLICY)
 
 
-def _check_input(context: Context, row: BlobRow) -> None:
-    """Check that a stored input matches its database row.
+def _check(objects: ObjectStore, name: str, sha256: str, is_current: Callable[[], bool]) -> None:
+    """Check that a stored file matches its database row.
+
+    Args:
+        is_current: Callback that returns whether the row still refers to the file.
 
     Raises:
         LostFileError, DamagedFileError: If the file is missing or damaged.
-        NotFoundError: If the file has just been deleted with its job.
+        NotFoundError: If the file has just been replaced by another one, or deleted with its job.
     """
     try:
-        context.blobs.objects.check_once(f"{BLOBS}/{row.location}", row.sha256)
+        objects.check_once(name, sha256)
     except LostFileError:
-        if not context.store.inputs.blobs([row.sha256]):
-            raise problems.FILE_REMOVED() from None
-        raise
+        if is_current():
+            raise
+        raise problems.FILE_REMOVED() from None
 
 
 def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tuple[dict[str, Any], BlobRow]:
@@ -540,26 +543,16 @@ async def _find_artifact(context: Context, caller: Caller, job: JobRow, name: st
 
 def artifact_file(context: Context, owner: str, row: ArtifactRow, name: str, kind: str) -> SentFile:
     """Return a stored result for sending it under a name, with a media type."""
-    check, read = partial(check_artifact, context, row), partial(context.artifacts.objects.read, row.location)
+    objects = context.artifacts.objects
+
+    def is_current() -> bool:
+        now = context.store.jobs.artifact(row.job_id, row.name)
+        return now is not None and now.location == row.location
+
+    check, read = partial(_check, objects, row.location, row.sha256, is_current), partial(objects.read, row.location)
     policy = _SANDBOX if kind.startswith("text/html") else None
     inline = kind.startswith(_INLINE) and row.name != PAGE  # the policy would not let the page show anything
     return SentFile(owner, row.sha256, row.size, name, kind, check, read, policy, inline=inline)
-
-
-def check_artifact(context: Context, row: ArtifactRow) -> None:
-    """Check that a stored result matches its database row.
-
-    Raises:
-        LostFileError, DamagedFileError: If the file is missing or damaged.
-        NotFoundError: If the file has just been replaced by another one, or its job has been deleted.
-    """
-    try:
-        context.artifacts.objects.check_once(row.location, row.sha256)
-    except LostFileError:
-        now = context.store.jobs.artifact(row.job_id, row.name)
-        if now is None or now.location != row.location:
-            raise problems.FILE_REMOVED() from None
-        raise
 
 
 @artifacts_router.post(
