@@ -98,15 +98,14 @@ class _StoreCollector(Collector):
     def collect(self) -> Iterable[Metric]:
         operations = self._store.operations
         depth = GaugeMetricFamily("sgsst_jobs", "Jobs by status.", labels=["status"])
-        counts = operations.job_counts()
+        counts, waited, rate = operations.work()
         for status in JobStatus:
             depth.add_metric([status], counts.get(status, 0))
         yield depth
         yield from self._counters()
         alive, disk = operations.dispatchers(), shutil.disk_usage(self._folder)
-        rate = sum(step / seconds for step, seconds in operations.steps_and_seconds())
         for name, text, value in (
-            ("queue_oldest_seconds", "Seconds that the oldest queued job has waited.", operations.oldest_queued()),
+            ("queue_oldest_seconds", "Seconds that the oldest queued job has waited.", waited),
             ("iterations_per_second", "Iterations per second of all running jobs together.", rate),
             ("dispatchers", "Dispatchers that are alive.", len(alive)),
             ("slots", "GPUs, or slots for jobs on hosts without GPUs.", sum(row.slots for row in alive)),

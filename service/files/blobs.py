@@ -144,12 +144,25 @@ class Blobs(ABC):
             NotFoundError: If the upload or receipt is gone.
         """
 
-    @abstractmethod
     def remove(self, locations: Iterable[str]) -> None:
-        """Remove the files of blobs whose rows have been deleted.
+        """Remove the files of blobs whose rows have been deleted; housekeeping removes what the store holds back."""
+        for location in locations:
+            try:
+                self.objects.remove(f"{BLOBS}/{location}")
+            except StoreError as error:
+                _log.warning("unused input not deleted yet: name=%s error=%s", location, error.__cause__)
 
-        If a file cannot be removed now, housekeeping removes it.
+    def _register(self, sha256: str, location: str, size: int, upload_id: str | None) -> str:
+        """Register a stored file as a blob, and return the blob's location: another one if its content is known.
+
+        Raises:
+            NotFoundError: If the upload or receipt that should hold the blob is gone; the file is removed.
         """
+        try:
+            return self._inputs.add_blob(sha256, location, size, upload_id)
+        except NotFoundError:
+            self.remove([location])
+            raise
 
     @abstractmethod
     def fetch(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
@@ -165,8 +178,7 @@ class Blobs(ABC):
             StoreError: If the file store does not respond.
         """
 
-    @abstractmethod
-    def start_upload(self, upload_id: str) -> None:
+    def start_upload(self, upload_id: str) -> None:  # noqa: B027 (nothing to prepare by default)
         """Prepare for receiving the bytes of a new upload, whose database row exists already."""
 
     @abstractmethod
@@ -240,11 +252,7 @@ class BlobFolder(Blobs):
         else:
             path.replace(final)
         flush_folder(final.parent)
-        try:
-            location = self._inputs.add_blob(sha256, f"{final.parent.name}/{final.name}", size, upload_id)
-        except NotFoundError:
-            final.unlink()
-            raise
+        location = self._register(sha256, f"{final.parent.name}/{final.name}", size, upload_id)
         known = self._blobs / location
         intact = self.objects.fault(f"{BLOBS}/{location}", sha256) is None  # read even if new: time would tell which
         if known == final:
@@ -257,11 +265,6 @@ class BlobFolder(Blobs):
             final.unlink(missing_ok=True)  # renaming one of two hard links to the other is a no-op
             flush_folder(known.parent)
         return sha256
-
-    def remove(self, locations: Iterable[str]) -> None:
-        """Remove the files."""
-        for location in locations:
-            (self._blobs / location).unlink(missing_ok=True)
 
     def fetch(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:  # noqa: ARG002 (base signature)
         """Return the paths of the verified blobs; `folder` is not used."""
@@ -441,17 +444,8 @@ class StoredBlobs(Blobs):
         sha256, size = file_digest(path), path.stat().st_size
         location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
         self.objects.put(path, f"{BLOBS}/{location}")
-        self._repair(self._register(sha256, location, size, upload_id), sha256, path)
-        self._cache.adopt(path, sha256)
+        self._take_in(sha256, location, size, upload_id, path)
         return sha256
-
-    def remove(self, locations: Iterable[str]) -> None:
-        """Remove the objects."""
-        for location in locations:
-            try:
-                self.objects.remove(f"{BLOBS}/{location}")
-            except StoreError as error:
-                _log.warning("unused input not deleted yet: name=%s error=%s", location, error.__cause__)
 
     def fetch(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
         """Return links in `folder` to this host's cached copies, after fetching missing ones."""
@@ -463,32 +457,21 @@ class StoredBlobs(Blobs):
             self._cache.link(sha256, row.size, paths[sha256], partial(self.objects.get, f"{BLOBS}/{row.location}"))
         return paths
 
-    def _register(self, sha256: str, location: str, size: int, upload_id: str | None) -> str:
-        """Register an object as a blob and return the blob's location; a duplicate object is removed.
+    def _take_in(self, sha256: str, location: str, size: int, upload_id: str | None, path: Path) -> None:
+        """Register an object as a blob, and move its file into the cache.
 
-        Raises:
-            NotFoundError: If the upload or receipt that should hold the blob is gone; the object is removed.
+        If its content is known, the object is removed, and the file replaces the known blob if that is lost or damaged.
         """
-        try:
-            known = self._inputs.add_blob(sha256, location, size, upload_id)
-        except NotFoundError:
-            self.remove([location])
-            raise
+        known = self._register(sha256, location, size, upload_id)
         if known != location:
             self.remove([location])
-        return known
-
-    def _repair(self, location: str, sha256: str, path: Path) -> None:
-        """Replace a blob with this file if the blob is lost or damaged."""
         try:
-            self.objects.check(f"{BLOBS}/{location}", sha256)
+            self.objects.check(f"{BLOBS}/{known}", sha256)
         except (LostFileError, DamagedFileError):
-            self.objects.put(path, f"{BLOBS}/{location}")
+            self.objects.put(path, f"{BLOBS}/{known}")
+        self._cache.adopt(path, sha256)
 
     # --- uploads ---------------------------------------------------------------------------------------------------
-
-    def start_upload(self, upload_id: str) -> None:
-        """Do nothing: no preparation is needed."""
 
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
         """Return a writer that stores one object per `save`, so that any API process can continue the upload."""
@@ -526,8 +509,7 @@ class StoredBlobs(Blobs):
         # hash the stored object itself, because it becomes the blob
         self.objects.get(f"{BLOBS}/{joined}", whole)
         sha256 = file_digest(whole)
-        self._repair(self._register(sha256, joined, upload.length, upload.id), sha256, whole)
-        self._cache.adopt(whole, sha256)
+        self._take_in(sha256, joined, upload.length, upload.id, whole)
         return sha256
 
     def _join(self, upload_id: str, parts: Sequence[UploadPartRow]) -> str | None:

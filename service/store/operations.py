@@ -119,23 +119,19 @@ class Operations:
             rows = session.scalars(select(CounterRow).order_by(CounterRow.name, CounterRow.labels)).all()
         return [(row.name, row.labels, row.value) for row in rows]
 
-    def job_counts(self) -> dict[str, int]:
-        """Return the number of jobs by status."""
-        query = select(JobRow.status, func.count()).group_by(JobRow.status)
-        with self._database.reading() as session:
-            return dict(session.execute(query).all())
+    def work(self) -> tuple[dict[str, int], float, float]:
+        """Return the number of jobs by status, the waiting time of the oldest queued one, and the steps per second.
 
-    def oldest_queued(self) -> float:
-        """Return the waiting time of the oldest queued job in seconds; 0 if none is queued."""
+        Times are in seconds. They are 0 if no job is queued, and if none makes steps.
+        """
+        counts = select(JobRow.status, func.count()).group_by(JobRow.status)
         with self._database.reading() as session:
+            by_status = dict(session.execute(counts).all())
             oldest = session.scalar(select(func.min(JobRow.queued_at)).where(JobRow.status == JobStatus.QUEUED))
-        return 0.0 if oldest is None else max(0.0, self._database.clock() - oldest)
-
-    def steps_and_seconds(self) -> list[tuple[int, float]]:
-        """Return the number of steps of each running job, and their duration in seconds."""
-        with self._database.reading() as session:
-            rows = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
-        return [(progress["step"], progress["seconds"]) for progress in rows if progress and progress.get("seconds")]
+            running = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
+        waited = 0.0 if oldest is None else max(0.0, self._database.clock() - oldest)
+        rates = (each["step"] / each["seconds"] for each in running if each and each.get("seconds"))
+        return by_status, waited, sum(rates)
 
     def webhook_secret(self) -> str:
         """Return the secret that signs webhooks, in the format of Standard Webhooks; it is created on first use."""
