@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -18,7 +17,7 @@ import stamina
 
 from service.states import ENDED
 from sgsst_core.errors import InvalidInputError, OutputError, SgsstError
-from sgsst_core.files.atomic import disk_errors, replace, temporary_path
+from sgsst_core.files.atomic import disk_errors, file_digest, replace, temporary_path
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 #: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
@@ -57,8 +56,6 @@ class Download:
         self._target, self._progress = target, progress
         self._expected = ""
         self._done = self._size = 0
-        #: Hash of the first `_hashed` bytes of the partial file.
-        self._digest, self._hashed = hashlib.sha256(), 0
 
     @property
     def _part(self) -> Path:
@@ -93,8 +90,8 @@ class Download:
             )
         if response.status_code != httpx2.codes.PARTIAL_CONTENT:
             self.discard()
-            self._done = self._hashed = 0
-            self._digest, self._expected = hashlib.sha256(), stated[0]
+            self._done = 0
+            self._expected = stated[0]
             with disk_errors(self._target, self._part):
                 self._part.open("xb").close()
         self._size = self._done + int(response.headers.get("content-length", 0))
@@ -108,9 +105,6 @@ class Download:
         """
         with disk_errors(self._target, self._part, self._size), self._part.open("ab") as file:
             file.write(block)
-        if self._hashed == self._done:
-            self._digest.update(block)
-            self._hashed += len(block)
         self._done += len(block)
 
     def report(self) -> None:
@@ -124,12 +118,7 @@ class Download:
             ApiError: If the SHA-256 differs from the service's. The partial file is then deleted.
             OutputError: If another program holds the target open.
         """
-        with self._part.open("rb") as file:
-            file.seek(self._hashed)  # bytes that an earlier process has written have not been hashed
-            while block := file.read(BLOCK):
-                self._digest.update(block)
-                self._hashed += len(block)
-        if self._digest.hexdigest() != self._expected:
+        if file_digest(self._part) != self._expected:
             self.discard()
             raise ApiError(f"{self.path}: the download was damaged in transit. Try again.", 460)
         replace(self._part, self._target)

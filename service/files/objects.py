@@ -415,8 +415,6 @@ class FileCache:
         Args:
             reserve: Bytes to leave free below the limit.
         """
-        if self._total() + reserve <= self._limit:
-            return
         with self._locked("evict"):
             total = self._total() + reserve
             for path, status in sorted(self._entries(), key=lambda entry: entry[1].st_atime_ns):

@@ -11,14 +11,14 @@ import os
 import shutil
 import sys
 import time
-from collections import OrderedDict, deque
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 from service import problems
-from service.deadlines import FileThreads, suspended
+from service.deadlines import FileThreads, OwnerLimit, suspended
 from service.files.blobs import Blobs
 from service.inputs import PLAN, JobParameters, WorkRequest, stage
 from service.inspection.sandbox import missing
@@ -42,15 +42,13 @@ class Lanes:
     """
 
     def __init__(self, count: int) -> None:
-        self._free = count
-        self._active: set[str] = set()
-        # owners in the order of their turns; the owner of a finished turn moves to the end
-        self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
+        self._free, self._own = asyncio.Semaphore(count), OwnerLimit(1)
+        self._waiting: Counter[str] = Counter()
 
     @property
     def full(self) -> bool:
         """Whether a request would have to wait."""
-        return not self._free
+        return self._free.locked()
 
     @asynccontextmanager
     async def turn(self, owner: str) -> AsyncIterator[None]:
@@ -59,39 +57,17 @@ class Lanes:
         Raises:
             BUSY: If too many requests of this owner wait already.
         """
-        queue = self._waiting.setdefault(owner, deque())
-        if len(queue) >= MAX_WAITING:
+        if self._waiting[owner] >= MAX_WAITING:
             raise problems.BUSY("Too many files of this key are being checked. Try again later.")
-        granted: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        queue.append(granted)
-        self._grant_turns()
-        try:
-            await granted
+        async with AsyncExitStack() as stack:
+            self._waiting[owner] += 1
+            try:
+                # in this order, one request of each owner waits for its turn, behind those of the other owners
+                await stack.enter_async_context(self._own.of(owner))
+                await stack.enter_async_context(self._free)
+            finally:
+                self._waiting -= Counter([owner])
             yield
-        finally:
-            self._end_turn(owner, granted)
-
-    def _grant_turns(self) -> None:
-        for owner, queue in list(self._waiting.items()):
-            while queue and queue[0].cancelled():
-                queue.popleft()
-            if queue and self._free and owner not in self._active:
-                queue.popleft().set_result(None)
-                self._free -= 1
-                self._active.add(owner)
-            if not queue:
-                del self._waiting[owner]
-
-    def _end_turn(self, owner: str, granted: asyncio.Future[None]) -> None:
-        queue = self._waiting.get(owner, deque())
-        if not granted.cancelled():
-            self._free += 1
-            self._active.discard(owner)
-            if queue:
-                self._waiting.move_to_end(owner)
-        elif granted in queue:
-            queue.remove(granted)
-        self._grant_turns()
 
 
 #: Task of the inspecting process: validate a job's inputs, or plan the job as well.

@@ -59,11 +59,8 @@ class Outbox:
             "views.jpg": self._out / f"{_STEM}.views.jpg",
             CHECKPOINT: self._out / f"{_STEM}.checkpoint.safetensors",
         }
-        previews = self._out / "previews"
-        if previews.is_dir():
-            files |= {f"previews/{path.name}": path for path in previews.glob("[!.]*.jpg")}
-        live = self._out / LIVE
-        return files | ({f"{LIVE}{path.name}": path for path in live.glob("[!.]*")} if live.is_dir() else {})
+        files |= {f"previews/{path.name}": path for path in (self._out / "previews").glob("[!.]*.jpg")}
+        return files | {f"{LIVE}{path.name}": path for path in (self._out / LIVE).glob("[!.]*")}
 
     def results(self) -> dict[str, Path]:
         """Return the result files of an ended job."""

@@ -156,8 +156,7 @@ class _Uploader:
 
     def stop(self) -> None:
         self._stop.set()
-        if self._thread is not threading.current_thread():
-            self._thread.join()
+        self._thread.join()
 
 
 def fetch_checkpoint(artifacts: Artifacts, checkpoint: ArtifactRow | Published, out: Path) -> None:
