@@ -11,7 +11,7 @@ import contextlib
 import json
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -360,6 +360,7 @@ _THUMBNAIL = "thumbnail.jpg"
 _COLOR_SECONDS, _COLOR_SHARE = 2.0, 0.02
 #: Maximum fraction of the elapsed time that writing the colors may take.
 _COST_SHARE = 0.01
+_NO_COLORS = "The colors to watch could not be written"
 
 
 class Previews:
@@ -407,34 +408,40 @@ class Previews:
 
     def finish(self, stylizer: Stylizer) -> None:
         """Write the thumbnail of a finished job: a view whose left half is unstylized. It replaces the previews."""
-        try:
+        with _warning(self._warn, "The thumbnail could not be rendered"):
             before = _rendered(stylizer, stylizer.job.views.scene.sh_dc.to(stylizer.sh_dc.device), _THUMBNAIL_SIDE)
             after = _rendered(stylizer, stylizer.shown(), _THUMBNAIL_SIDE)
             save_thumbnail(self._folder, before, after)
-        except Exception as error:
-            self._warn(f"The thumbnail could not be rendered: {error}")
 
     def _write(self, step: int, render: Callable[[], Tensor | None]) -> None:
         """Write the preview of a step, if there is an image to write."""
-        try:
+        with _warning(self._warn, "The preview could not be rendered"):
             image = render()
             if image is None:
                 return
-            save_jpg(self._path(f"step_{step:07d}.jpg"), image)
-        except Exception as error:
-            self._warn(f"The preview could not be rendered: {error}")
+            save_jpg(_made(self._folder) / f"step_{step:07d}.jpg", image)
         self._last = time.monotonic()
 
-    def _path(self, name: str) -> Path:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        return self._folder / name
+
+@contextlib.contextmanager
+def _warning(warn: Warn, text: str) -> Iterator[None]:
+    """Warn of an error in the block instead of raising it."""
+    try:
+        yield
+    except Exception as error:
+        warn(f"{text}: {error}")
+
+
+def _made(folder: Path) -> Path:
+    """Create a folder if it does not exist, and return it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def save_thumbnail(folder: Path, before: Tensor, after: Tensor) -> None:
     """Write the thumbnail of a job to its folder of previews, given two images [h, w, 3] of one view."""
     middle = before.shape[1] // 2
-    folder.mkdir(parents=True, exist_ok=True)
-    save_jpg(folder / _THUMBNAIL, torch.cat([before[:, :middle], after[:, middle:]], dim=1))
+    save_jpg(_made(folder) / _THUMBNAIL, torch.cat([before[:, :middle], after[:, middle:]], dim=1))
 
 
 def _shown_view(covered: Sequence[int]) -> int:
@@ -477,29 +484,17 @@ class LiveColors:
 
     def share_scene(self, scene: Scene) -> None:
         """Write the scene to which the colors belong (`scene.ply`), whose rows are not those of the job's input."""
-        self._write(lambda: write_scene(self._path("scene.ply"), scene))
+        with _warning(self._warn, _NO_COLORS):
+            write_scene(_made(self._folder) / "scene.ply", scene)
 
     def __call__(self, stylizer: Stylizer) -> None:
         """Write the colors after a step if enough time has passed since the last time."""
         started = time.monotonic()
         if not stylizer.step or started < self._due:
             return
-        self._write(lambda: self._write_colors(stylizer))
+        with _warning(self._warn, _NO_COLORS):
+            colors = stylizer.job.scene.sh_dc.clone()
+            colors[stylizer.job.plan.seen] = stylizer.shown().cpu()
+            write_colors(_made(self._folder) / "colors.f16", colors)
         now = time.monotonic()
         self._due = now + max(_COLOR_SECONDS, _COLOR_SHARE * (now - self._started), (now - started) / _COST_SHARE)
-
-    def _write_colors(self, stylizer: Stylizer) -> None:
-        job = stylizer.job
-        colors = job.scene.sh_dc.clone()
-        colors[job.plan.seen] = stylizer.shown().cpu()
-        write_colors(self._path("colors.f16"), colors)
-
-    def _write(self, write: Callable[[], None]) -> None:
-        try:
-            write()
-        except Exception as error:
-            self._warn(f"The colors to watch could not be written: {error}")
-
-    def _path(self, name: str) -> Path:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        return self._folder / name

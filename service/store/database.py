@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,8 @@ _BUGS = (*(f"SQLITE_{each}" for each in ("CONSTRAINT", "ERROR", "MISMATCH", "MIS
 _BUGS += ("21", "22", "23", "42", "44", "54")
 #: Names of SQLite's and codes of PostgreSQL's errors for rows that refer to a missing one or exist already.
 _CHANGED = (*(f"SQLITE_CONSTRAINT_{each}" for each in ("FOREIGNKEY", "PRIMARYKEY", "UNIQUE")), "23503", "23505")
+
+_COUNTERS = Base.metadata.tables[CounterRow.__tablename__]
 
 _log = logging.getLogger(__name__)
 
@@ -397,8 +399,9 @@ def idempotency_row(session: Session, owner: str, key: str, fingerprint: str, no
 
 def count(session: Session, name: str, labels: str = "", amount: float = 1.0) -> None:
     """Add to a counter within the caller's transaction."""
-    statement = _add_statement(session.get_bind().dialect.name)
-    session.execute(statement, {"name": name, "labels": labels, "value": amount})
+    insert = upsert(session)(_COUNTERS).values(name=name, labels=labels, value=amount)
+    added = {"value": _COUNTERS.c.value + insert.excluded.value}
+    session.execute(insert.on_conflict_do_update(index_elements=["name", "labels"], set_=added))
 
 
 def observe(session: Session, name: str, seconds: float) -> None:
@@ -412,14 +415,6 @@ def observe(session: Session, name: str, seconds: float) -> None:
     bound = next((bound for bound in BUCKETS if seconds <= bound), None)
     if bound is not None:  # values above all bounds are in the count only
         count(session, f"{name}_bucket", f'le="{bound}"')
-
-
-@cache
-def _add_statement(dialect: str) -> Any:
-    table = Base.metadata.tables[CounterRow.__tablename__]
-    insert = (sqlite.insert if dialect == "sqlite" else postgresql.insert)(table)
-    added = table.c.value + insert.excluded.value
-    return insert.on_conflict_do_update(index_elements=["name", "labels"], set_={"value": added})
 
 
 def upsert(session: Session) -> Any:
