@@ -29,7 +29,7 @@ from service.problems import ConflictError, DamagedFileError, LostFileError, NoS
 from service.settings import ServiceSettings
 from service.store.files import BLOBS, UPLOADS, InputRows, check_offset
 from service.store.tables import BlobRow, UploadPartRow, UploadRow
-from sgsst_core.files.atomic import file_digest
+from sgsst_core.files.atomic import file_digest, flush_folder
 
 _log = logging.getLogger(__name__)
 
@@ -398,15 +398,6 @@ def write_all(file: object, data: bytes) -> None:
     with disk_errors():
         while view:
             view = view[file.write(view) :]  # type: ignore[attr-defined]
-
-
-def flush_folder(folder: Path) -> None:
-    """Make the entries of a folder durable (fsync)."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def open_blobs(settings: ServiceSettings, inputs: InputRows, artifacts: Artifacts) -> Blobs:

@@ -32,7 +32,7 @@ from service import problems
 from service.problems import StoreError
 from service.states import Published
 from sgsst_core.errors import OutputError
-from sgsst_core.files.atomic import atomic_path, file_digest
+from sgsst_core.files.atomic import DISK_FULL, atomic_path, file_digest
 from sgsst_core.files.formats import RESULT_FORMATS
 
 #: Limits of each request to S3: timeouts for connecting and for responses in seconds, and number of tries, with
@@ -75,8 +75,7 @@ def disk_errors() -> Iterator[None]:
         cause = error.__cause__ if isinstance(error, OutputError) else error
         if not isinstance(cause, OSError) or cause.errno in (errno.ENOENT, errno.EMFILE, errno.ENFILE):
             raise
-        full = cause.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        problem = problems.NO_SPACE if full else problems.STORE_UNAVAILABLE
+        problem = problems.NO_SPACE if cause.errno in DISK_FULL else problems.STORE_UNAVAILABLE
         raise problem(f"The service cannot write the file: {cause.strerror}.") from error
 
 
@@ -352,8 +351,6 @@ def _changed(entry: dict[str, Any]) -> float:
 _FETCHES = 2
 #: Age in seconds at which partially fetched files are removed; no fetch takes that long, so their processes have died.
 _PARTIAL_SECONDS = 6 * 3600.0
-#: Error numbers of a full disk.
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 #: Function that copies an object of the store to a file.
@@ -517,7 +514,7 @@ class FileCache:
 def is_full(error: BaseException | None) -> bool:
     """Return whether an error, or one of its causes, reports a full disk."""
     while error is not None:
-        if isinstance(error, OSError) and error.errno in _DISK_FULL:
+        if isinstance(error, OSError) and error.errno in DISK_FULL:
             return True
         error = error.__cause__ or error.__context__
     return False

@@ -54,7 +54,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
     except BaseException:  # includes KeyboardInterrupt: no partial file may remain
         temporary.unlink(missing_ok=True)
         raise
-    _flush_folder(final.parent)
+    flush_folder(final.parent)
 
 
 class HeldOpenError(OutputError):
@@ -179,7 +179,7 @@ def temporary_path(final: Path, unique: str, suffix: str = "") -> Path:
     return final.with_name(f".sgsst-{tag}-{unique}.part{suffix}")
 
 
-def _flush_folder(folder: Path) -> None:
+def flush_folder(folder: Path) -> None:
     """Flush a folder to make a rename durable, if the system supports it. The file is complete either way."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
