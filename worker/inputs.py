@@ -347,8 +347,9 @@ def read_scene_and_capture(source: SceneRequest) -> tuple[SceneFile, Capture]:
 
     Raises:
         SceneError: If the scene cannot be used.
-        CameraError: If the cameras cannot be used.
+        CameraError: If the options contradict each other, which is checked first, or the cameras cannot be used.
     """
+    check_choice(source)
     file, decisions = read_requested(source)
     capture = read_capture(source, file.scene).checked(file.scene, source.near)
     return file, replace(capture, decisions=(*decisions, *capture.decisions))

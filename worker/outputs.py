@@ -15,6 +15,10 @@ from sgsst_core.files.formats.sog import STREAMED_SOG
 from worker.job import JobSpec, check_choice, check_steps
 
 
+#: Other suffixes of the same kind of file.
+_OTHER_SUFFIXES = {".jpg": ".jpeg", ".html": ".htm"}
+
+
 def result_format(out: Path) -> SceneFormat:
     """Return the format of a scene to write, by its file name.
 
@@ -25,6 +29,21 @@ def result_format(out: Path) -> SceneFormat:
     if format is None or format.write is None:
         raise OutputError(f"{out}: does not end in {RESULT_SUFFIXES}. Name the scene file to write.")
     return format
+
+
+def check_suffix(out: Path, kind: str, example: str) -> None:
+    """Check the suffix of a file to write: a mistyped path must not overwrite a scene.
+
+    Args:
+        kind: Kind of the file, with its article, for the message.
+        example: Name such as "plan.json", whose suffix the file must have.
+
+    Raises:
+        OutputError: If it has another suffix.
+    """
+    suffix = Path(example).suffix
+    if out.suffix.lower() not in (suffix, _OTHER_SUFFIXES.get(suffix)):
+        raise OutputError(f"{out}: not the name of {kind}. Give one, such as {example}.")
 
 
 def check_is_not_input(out: Path, path: Path, description: str = "scene itself", remark: str = "") -> None:

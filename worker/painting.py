@@ -14,7 +14,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
-from sgsst_core.errors import CameraError, ImageError, OutputError
+from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.atomic import atomic_path, write_json
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.images import image_size, load_image, to_image
@@ -40,7 +40,7 @@ from worker.inputs import (
 )
 from worker.job import JobSpec, Result, SceneRequest, check_choice
 from worker.options import CameraParameters, PaintedFile, PaintedOptions
-from worker.outputs import Outputs, check_file, check_is_not_input, result_format
+from worker.outputs import Outputs, check_file, check_is_not_input, check_suffix, result_format
 from worker.prepare import Prepared, describe_scene, save_thumbnail
 
 if TYPE_CHECKING:
@@ -114,8 +114,7 @@ def export_view(source: SceneRequest, name: str, background: Color, out: Path) -
     Raises:
         InvalidInputError: If scene or cameras cannot be used, no view has this name, or `out` is not a PNG's name.
     """
-    if out.suffix.lower() != ".png":  # a mistyped path must not overwrite a scene
-        raise OutputError(f"{out}: not the name of a PNG image. Give one, such as {name}.png.")
+    check_suffix(out, "a PNG image", f"{name}.png")
     file, capture = read_scene_and_capture(source)
     camera = camera_named(capture.cameras, name)
     image = _render(make_rasterizer("cpu", file.scene, background=background, near=source.near), file, camera)

@@ -33,7 +33,7 @@ from api.cli.options import (
     with_arguments,
     with_options,
 )
-from sgsst_core.errors import OutputError, SettingsError
+from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
 from sgsst_core.progress import clock, duration
 from sgsst_core.stylizing.progress_bar import job_bar, live_bar
@@ -303,10 +303,10 @@ def view(
     from worker.derived import viewpoint_of, write_page
     from worker.inputs import read_requested
     from worker.job import SceneRequest
+    from worker.outputs import check_suffix
     from worker.painting import camera_named
 
-    if out.suffix.lower() not in (".html", ".htm"):
-        raise OutputError(f"{out}: not the name of an HTML file. Give one, such as scene.html.")
+    check_suffix(out, "an HTML file", "scene.html")
     names = [name.strip() for name in views.split(",") if name.strip()]
     if (start or names) and cameras is None:
         raise SettingsError("--start and --views name cameras. Add --cameras, or omit them.")

@@ -19,7 +19,7 @@ from torch import Tensor
 from api.cli.options import local_path
 from api.static_files import FOLDER
 from sgsst_core.devices import seconds_left
-from sgsst_core.errors import OutputError, SettingsError
+from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, write_json
 from sgsst_core.files.images import load_image, save_png
@@ -41,7 +41,7 @@ from worker.derived import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import ViewOptions, split_weight
-from worker.outputs import check_is_not_input
+from worker.outputs import check_is_not_input, check_suffix
 from worker.painting import camera_named
 from worker.prepare import dry_run
 
@@ -101,13 +101,11 @@ def make_plan(
     source, settings, out = request.source, request.settings, request.out
     left = seconds_left(settings.within, started)
     check_choice(source, request.images)
-    if out.suffix.lower() != ".json":  # a mistyped path must not overwrite a scene or its cameras
-        raise OutputError(f"{out}: not the name of a JSON file. Give one, such as plan.json.")
+    check_suffix(out, "a JSON file", "plan.json")
     if source.cameras:
         check_is_not_input(out, source.cameras, "camera file")
     if sheet is not None:
-        if sheet.suffix.lower() not in (".jpg", ".jpeg"):
-            raise OutputError(f"{sheet}: not the name of a JPEG file. Give one, such as views.jpg.")
+        check_suffix(sheet, "a JPEG file", "views.jpg")
         for path, description in _input_images(request):
             check_is_not_input(sheet, path, description)
     inputs = read_inputs(request)
@@ -141,7 +139,6 @@ def look_for_extremes(source: SceneRequest, style: Path | None) -> list[Finding]
     Raises:
         InvalidInputError: If scene, cameras or style cannot be used.
     """
-    check_choice(source)
     image = load_image(style) if style else None
     file, capture = read_scene_and_capture(source.model_copy(update={"drop_invalid": True}))
     count = len(capture.cameras)
@@ -172,7 +169,6 @@ def render_views(
     Raises:
         InvalidInputError: If scene, cameras or folder cannot be used.
     """
-    check_choice(source)
     file, capture = read_scene_and_capture(source)
     scene, cameras = file.scene, capture.cameras
     rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near, memory=0)
@@ -212,9 +208,7 @@ def render_panorama(
     Raises:
         InvalidInputError: If scene or cameras cannot be used, no camera has this name, or `out` is not a PNG's name.
     """
-    check_choice(source)
-    if out.suffix.lower() != ".png":  # a mistyped path must not overwrite a scene
-        raise OutputError(f"{out}: not the name of a PNG image. Give one, such as panorama.png.")
+    check_suffix(out, "a PNG image", "panorama.png")
     file, capture = read_scene_and_capture(source)
     scene, cameras = file.scene, capture.cameras
     camera = cameras[0] if name is None else camera_named(cameras, name)
@@ -322,7 +316,6 @@ class _Inputs:
         """Check and read the files of a request; the quick checks come first."""
         from sgsst_core.bench.variants import choose_variants
 
-        check_choice(request.source)
         variants = choose_variants(request.variants)
         weights = load_network_weights(request.backbone)
         style = load_image(request.style)
@@ -491,11 +484,8 @@ def make_study(
     """
     scenes = [named(text) for text in variants]
     check_names([name for name, _ in scenes])
-    if page.suffix.lower() not in (".html", ".htm"):
-        raise OutputError(f"{page}: not the name of an HTML file. Give one, such as study.html.")
+    check_suffix(page, "an HTML file", "study.html")
     sources = [source.model_copy(update={"scene": path}) for _, path in scenes]
-    for each in sources:
-        check_choice(each)
     image = load_image(style)
     side = source.resolution or STUDY_SIDE
     cameras = [resized(camera, min(side, camera.side)) for camera in read_scene_and_capture(sources[0])[1].cameras]
