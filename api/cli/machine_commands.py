@@ -14,6 +14,7 @@ from rich.table import Table
 
 from api.cli.console import FAILURE, PlainConsole, error_console, out_console, transfer_bar
 from api.cli.options import JsonOption
+from sgsst_core.errors import SettingsError
 
 if TYPE_CHECKING:
     from service.settings import ServiceSettings
@@ -224,8 +225,6 @@ def usage_of_all(data: Path, since: str | None, until: str | None) -> list[dict[
     Raises:
         SettingsError: If there is no database, or a text is no day.
     """
-    from sgsst_core.errors import SettingsError
-
     try:
         first, last = (None if day is None else date.fromisoformat(day) for day in (since, until))
     except ValueError as error:
@@ -236,8 +235,6 @@ def usage_of_all(data: Path, since: str | None, until: str | None) -> list[dict[
 
 def _service_settings(data: Path | None) -> ServiceSettings:
     """Return the settings from the environment, to which a data folder is added for other processes."""
-    from sgsst_core.errors import SettingsError
-
     if os.name != "posix":
         raise SettingsError(
             "The service does not run on Windows itself. Run this command in WSL2 (`wsl --install`), or run the "
@@ -257,8 +254,6 @@ def _open_existing_store(data: Path | None) -> Store:
         SettingsError: If there is no database.
     """
     from sqlalchemy.engine import make_url
-
-    from sgsst_core.errors import SettingsError
 
     url = make_url(_service_settings(data).database_url)
     if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():  # which opening would create

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import typer
 from pydantic import BaseModel, ValidationError
@@ -22,6 +22,7 @@ from service.inputs import JobParameters
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import SUFFIXES, scene_path
 from sgsst_core.settings import BY_PRESET, Declared, declared, merged, reason
+from worker.job import JobSpec, SceneRequest, default_cameras
 from worker.options import (
     ESSENTIALS,
     GROUPS,
@@ -39,9 +40,6 @@ from worker.options import (
     region_requests,
 )
 from worker.outputs import check_file, check_folder
-
-if TYPE_CHECKING:
-    from worker.job import JobSpec, SceneRequest
 
 Command = Callable[..., None]
 M = TypeVar("M", bound=BaseModel)
@@ -261,8 +259,6 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 def cameras_of(scene: str | Path, given: Any, options: ViewOptions) -> Any:
     """Return the given cameras of a scene; without any, those of `default_cameras`, and print which they are."""
-    from worker.job import default_cameras
-
     path = path_or_url(scene)
     if given is not None or isinstance(path, str):
         return given
@@ -274,8 +270,6 @@ def cameras_of(scene: str | Path, given: Any, options: ViewOptions) -> Any:
 
 def source_of(scene: Path, cameras: Path | None, options: ViewOptions) -> SceneRequest:
     """Return the request for a scene, whose cameras are those of `cameras_of`."""
-    from worker.job import SceneRequest
-
     return SceneRequest.of(scene, cameras_of(scene, cameras, options), options)
 
 
@@ -357,8 +351,6 @@ class JobArguments:
         Raises:
             SettingsError: If options are malformed or contradict each other, or a file is a URL.
         """
-        from worker.job import JobSpec
-
         for style in self.style:
             local_path(style)
         cameras = None if self.cameras is None else local_path(self.cameras)

@@ -37,6 +37,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
 from sgsst_core.progress import clock, duration
 from sgsst_core.stylizing.progress_bar import job_bar, live_bar
+from worker.job import JobSpec, SceneRequest
 from worker.options import (
     ESSENTIALS,
     MOST_VIEWPOINTS,
@@ -46,6 +47,7 @@ from worker.options import (
     ViewOptions,
     Viewpoints,
 )
+from worker.outputs import Outputs, check_suffix
 
 if TYPE_CHECKING:
     from api.cli.scene_tools import VariantsRequest
@@ -159,8 +161,6 @@ def render(
     chosen: StylizeOptions,
 ) -> None:
     """Render all views of a scene as images, a video along a camera path, or a 360-degree image."""
-    from worker.job import SceneRequest
-
     background = chosen.settings().background
     given = [*video_options.model_fields_set, *(["compare"] if compare else []), *(["transparent"] * transparent)]
     if [out, video, panorama].count(None) != 2:
@@ -256,7 +256,6 @@ def convert(
 ) -> None:
     """Convert a scene to another format, which the name of OUT determines."""
     from worker.derived import convert as convert_scene
-    from worker.job import SceneRequest
 
     source = SceneRequest.of(scene, cameras, options)
     converted = convert_scene(source, out, compare=compare, levels_of=levels_of, pad_sh=chosen.pad_sh)
@@ -302,8 +301,6 @@ def view(
     from worker.capture import read_capture
     from worker.derived import viewpoint_of, write_page
     from worker.inputs import read_requested
-    from worker.job import SceneRequest
-    from worker.outputs import check_suffix
     from worker.painting import camera_named
 
     check_suffix(out, "an HTML file", "scene.html")
@@ -391,8 +388,6 @@ def paint(
     chosen: StylizeOptions,
 ) -> None:
     """Paint one view or several, and the scene follows."""
-    from worker.job import JobSpec
-    from worker.outputs import Outputs
     from worker.painting import export_view, run_painting
     from worker.ranks.rank import WorkerOptions
     from worker.run import Listener

@@ -31,14 +31,14 @@ from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
 from sgsst_core.progress import clock
 from sgsst_core.stylizing.progress_bar import job_bar
+from worker.job import JobSpec, Result
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
+from worker.outputs import Outputs, check_request
 from worker.processes import STOP_SIGNALS
+from worker.ranks.rank import WorkerOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
-    from worker.job import JobSpec, Result
-    from worker.outputs import Outputs
     from worker.prepare import Prepared
-    from worker.ranks.rank import WorkerOptions
     from worker.run import Ended
 
 #: Resolution and number of steps of the demo, and its time budget, which ends the steps on a slow machine. The whole
@@ -67,8 +67,6 @@ def stylize(
 ) -> None:
     """Stylize a scene with one or several style images."""
     request = inputs.request(options, out, resume=run.resume)
-    from worker.ranks.rank import WorkerOptions
-
     invocation: Invocation = context.obj
     run_options = WorkerOptions(run.rank_timeout, run.checkpoint_seconds, started=invocation.started)
     run_job(request, _resuming(invocation.arguments), options.workers, run_options)
@@ -115,8 +113,6 @@ def run_job(
     Args:
         command: Command that resumes the job, for messages.
     """
-    from worker.outputs import check_request
-    from worker.ranks.rank import WorkerOptions
     from worker.run import Listener, stylize
 
     outputs, stop, notify = check_request(request), StopFlag(), error_console.print

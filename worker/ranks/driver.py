@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from sgsst_core.errors import ClusterAwayError, InfrastructureError, RanksDriftedError, RanksFailedError, SgsstError
-from worker.job import scene_bytes
+from worker.job import Resume, scene_bytes
 from worker.processes import ProcessId, home, kill
 from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, first_line, reserve
 from worker.ranks.rank import Outcome, RankPlace, RankProcess, RankStatus, RankTask, WorkerOptions, Workplace
@@ -159,8 +159,6 @@ class _Attempts:
                 look_for_losses(self._group, self._cluster, self._options.rank_timeout)
 
     def _task(self, number: int, address: str) -> RankTask:
-        from worker.job import Resume
-
         reservation, workplace = self._group.reservation, self._options.workplace
         assert reservation is not None
         resume = Resume(self._request.resume, self._options.resume_required)
