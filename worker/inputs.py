@@ -12,14 +12,13 @@ file, which every rank opens.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import mmap
 import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -216,7 +215,7 @@ def _check_masks(regions: Sequence[RegionRequest], names: Sequence[str], limits:
                     limits.check_image(path)
 
 
-@contextlib.contextmanager
+@contextmanager
 def errors_of(role: str) -> Iterator[None]:
     """Mark errors with the role of the input that they concern."""
     try:

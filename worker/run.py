@@ -11,13 +11,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from worker.job import Resume
+from worker.job import JobSpec, Result, Resume
 from worker.ranks.rank import WorkerOptions
 
 if TYPE_CHECKING:
     from sgsst_core.parallel.collectives import Collectives
     from sgsst_core.progress import Progress
-    from worker.job import JobSpec, Result
     from worker.prepare import Prepared
 
 

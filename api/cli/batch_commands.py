@@ -23,15 +23,16 @@ from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_o
 from sgsst_core.files.atomic import file_digest, write_json
 from sgsst_core.files.formats import SUFFIXES, scene_path
 from sgsst_core.settings import declared
+from worker.job import JobSpec
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
-from worker.outputs import check_is_not_input
+from worker.outputs import Outputs, check_is_not_input
+from worker.ranks.rank import WorkerOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from api.client import Client
     from sgsst_core.scene.gaussians import Scene
-    from worker.job import JobSpec
 
 #: Names of the record of a batch, and of its contact sheet, in the folder of the results.
 _RECORD, _SHEET = "batch.json", "batch.jpg"
@@ -188,9 +189,6 @@ def _make(
     results: _Batch, name: str, request: JobSpec, options: StylizeOptions, run: RunOptions, invocation: Invocation
 ) -> None:
     """Make a result on this machine, from its checkpoint if there is one."""
-    from worker.outputs import Outputs
-    from worker.ranks.rank import WorkerOptions
-
     entry = results.entry(name, _inputs(request))
     print_field("complete" if entry.complete else "result", request.out)
     if entry.complete:

@@ -8,12 +8,11 @@ with Client("http://127.0.0.1:8000") as client:
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import re
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar, cast
 from urllib.parse import quote
@@ -402,7 +401,7 @@ def _iterating(
                 yield item
         finally:
             # An interrupt can leave the iteration running; it is canceled with the portal.
-            with contextlib.suppress(RuntimeError):
+            with suppress(RuntimeError):
                 client._run(items.aclose)
 
     return cast("Callable[Concatenate[Client, P], Iterator[T]]", iterating)

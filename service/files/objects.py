@@ -19,7 +19,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -617,7 +616,7 @@ def _link(source: Path, target: Path) -> bool:
     return True
 
 
-@contextmanager
+@contextlib.contextmanager
 def _snapshot(source: Path) -> Iterator[Path]:
     """Provide a second hard link to a file, so that replacing the file during its upload does not affect the upload."""
     link = source.with_name(f".{secrets.token_hex(6)}-{source.name}")

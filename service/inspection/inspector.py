@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hashlib
 import json
 import logging
@@ -13,7 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -191,7 +190,7 @@ class InspectionProcess:
         """Kill the process; its child that reads files dies with it."""
         process, self._process = self._process, None
         if process is not None and process.returncode is None:
-            with contextlib.suppress(ProcessLookupError):
+            with suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
 
@@ -235,7 +234,7 @@ class Processes:
         """Start processes that check and plan jobs in advance: their imports take seconds."""
         for threads in {1, self._threads["plan"]}:
             self._idle.append(process := self._take(threads))
-            with contextlib.suppress(OSError):  # the next request starts it, or tells why it cannot
+            with suppress(OSError):  # the next request starts it, or tells why it cannot
                 await process.start()
 
     async def close(self) -> None:
@@ -407,7 +406,7 @@ def stored_plan(
 
 def _store_plan(file: Path, target: Path) -> None:
     """Move a plan to its place, and delete the oldest ones; a job whose plan is missing plans again."""
-    with contextlib.suppress(OSError):  # another process may delete the same ones
+    with suppress(OSError):  # another process may delete the same ones
         target.parent.mkdir(exist_ok=True)
         file.replace(target)
         for old in sorted(target.parent.iterdir(), key=lambda path: path.stat().st_mtime)[:-_MAX_PLANS]:

@@ -10,7 +10,6 @@ preceded by lines of progress, `{"planning": ...}`, and that of a plan by the fi
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import math
 import os
@@ -23,7 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -453,7 +452,7 @@ def _confine(request: WorkRequest) -> list[None]:
     return uncompiled
 
 
-@functools.cache
+@cache
 def _compile_kernels() -> None:
     """Compile kernels for later children, by planning a small built-in scene in an unconfined child.
 

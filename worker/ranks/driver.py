@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from sgsst_core.errors import ClusterAwayError, InfrastructureError, RanksDriftedError, RanksFailedError, SgsstError
-from worker.job import Resume, scene_bytes
+from worker.job import JobSpec, Result, Resume, scene_bytes
 from worker.processes import ProcessId, home, kill
 from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, first_line, reserve
 from worker.ranks.rank import Outcome, RankPlace, RankProcess, RankStatus, RankTask, WorkerOptions, Workplace
@@ -30,7 +30,6 @@ from worker.run import Ended, Listener, LostAttempt
 
 if TYPE_CHECKING:
     from sgsst_core.progress import Progress
-    from worker.job import JobSpec, Result
 
 
 #: Seconds that an interrupted job has to finish its step and save a checkpoint.
