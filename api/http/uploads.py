@@ -336,29 +336,26 @@ class _Writer:
         self._seconds = context.settings.upload_hours * 3600
         self._part = context.blobs.append(row, self._seconds)
         self._digest = hashlib.new(checksum[0]) if checksum else None
-        self._offset = self._saved = row.offset
 
     def write(self, block: bytes) -> None:
-        if self._offset + len(block) > self._row.length:
+        if self._part.offset + len(block) > self._row.length:
             raise _longer_than_declared(self._row.length)
         with self._lock:
             self._context.blobs.ensure_space(len(block))
             self._part.write(block)
-            self._offset += len(block)
             if self._digest is not None:
                 self._digest.update(block)
-            elif self._offset - self._saved >= _SAVE_BYTES:
+            elif self._part.offset - self._part.saved >= _SAVE_BYTES:
                 self.save()
 
     @property
     def complete(self) -> bool:
         """Whether all bytes of the upload have been written."""
-        return self._offset == self._row.length
+        return self._part.offset == self._row.length
 
     def save(self) -> float:
         """Make the received bytes durable, then update the database. Return the upload's new expiry time."""
         with self._lock:
-            self._saved = self._offset
             return self._part.save()
 
     def finish(self) -> float:

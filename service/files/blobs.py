@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from io import FileIO
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 from service import problems
 from service.files.objects import Artifacts, FileCache, ObjectStore, disk_errors
@@ -77,12 +77,24 @@ class Receiver:
             self.path.unlink(missing_ok=True)
 
 
-class PartWriter(Protocol):
-    """Writer of the next bytes of an upload."""
+class PartWriter(ABC):
+    """Writer of the next bytes of an upload.
+
+    Attributes:
+        offset: Offset of the next byte.
+        saved: Offset up to which all bytes are saved.
+    """
+
+    def __init__(self, inputs: InputRows, upload: UploadRow, seconds: float, file: FileIO) -> None:
+        self._inputs, self._upload, self._seconds, self._file = inputs, upload, seconds, file
+        self.offset = self.saved = upload.offset
 
     def write(self, data: bytes) -> None:
         """Append bytes; they become part of the upload with the next `save`."""
+        write_all(self._file, data)
+        self.offset += len(data)
 
+    @abstractmethod
     def save(self) -> float:
         """Make the bytes durable, record them in the database, and return the upload's new expiry time.
 
@@ -90,11 +102,13 @@ class PartWriter(Protocol):
             ConflictError: If another request has saved bytes at the same offset meanwhile.
         """
 
+    @abstractmethod
     def discard(self) -> None:
         """Drop the bytes written since the last `save`."""
 
     def close(self) -> None:
         """Close the writer; unsaved bytes are lost."""
+        self._file.close()
 
 
 class Blobs(ABC):
@@ -304,18 +318,16 @@ class BlobFolder(Blobs):
         return self.uploads / f"{upload_id}.part"
 
 
-class _FileWriter:
+class _FileWriter(PartWriter):
     """Writer to the file of an unfinished upload, starting at the offset in the database.
 
     Each writer locks the file, so that only one writer per upload is open at a time across all processes.
     """
 
     def __init__(self, path: Path, inputs: InputRows, upload: UploadRow, seconds: float) -> None:
-        self._inputs, self._upload, self._seconds = inputs, upload, seconds
-        self._offset = self._saved = upload.offset
         try:
             with disk_errors():
-                self._file = open_file(path, "r+b")
+                file = open_file(path, "r+b")
         except FileNotFoundError:
             raise problems.LOST_UPLOAD(upload_id=upload.id) from None
         except StoreError:
@@ -323,38 +335,31 @@ class _FileWriter:
             if inputs.upload(upload.id, upload.owner).offset == upload.length:
                 raise problems.UPLOAD_LOCKED() from None
             raise
+        super().__init__(inputs, upload, seconds, file)
         try:
-            _lock(self._file)
+            _lock(file)
             # read the row again: no other writer changes it while the lock is held
             check_offset(inputs.upload(upload.id, upload.owner), upload.offset)
             # writing beyond the end of the file would fill the gap with zeros
-            if os.fstat(self._file.fileno()).st_size < upload.offset:
+            if os.fstat(file.fileno()).st_size < upload.offset:
                 raise problems.LOST_UPLOAD(upload_id=upload.id)
-            self._file.truncate(upload.offset)  # a crash may have left unrecorded bytes
-            self._file.seek(upload.offset)
+            self.discard()  # a crash may have left unrecorded bytes
         except BaseException:
-            self._file.close()
+            file.close()
             raise
-
-    def write(self, data: bytes) -> None:
-        write_all(self._file, data)
-        self._offset += len(data)
 
     def save(self) -> float:
         with disk_errors():
             os.fsync(self._file.fileno())
-        size = self._offset - self._saved
-        expires = self._inputs.advance_upload(self._upload.id, self._saved, size, self._seconds)
-        self._saved = self._offset
+        size = self.offset - self.saved
+        expires = self._inputs.advance_upload(self._upload.id, self.saved, size, self._seconds)
+        self.saved = self.offset
         return expires
 
     def discard(self) -> None:
-        self._file.truncate(self._saved)
-        self._file.seek(self._saved)
-        self._offset = self._saved
-
-    def close(self) -> None:
-        self._file.close()
+        self._file.truncate(self.saved)
+        self._file.seek(self.saved)
+        self.offset = self.saved
 
 
 def open_file(path: Path, mode: str) -> FileIO:
@@ -538,40 +543,35 @@ class StoredBlobs(Blobs):
         self._cache.evict()
 
 
-class _ObjectWriter:
+class _ObjectWriter(PartWriter):
     """Writer of an upload's bytes: a file on this host buffers them until they are saved to the store."""
 
     def __init__(
         self, folder: Path, objects: ObjectStore, inputs: InputRows, upload: UploadRow, seconds: float
     ) -> None:
-        self._objects, self._inputs, self._upload, self._seconds = objects, inputs, upload, seconds
-        self._path = folder / f"{secrets.token_hex(12)}.part"
-        self._file = self._path.open("wb", buffering=0)
-        self._start, self._size = upload.offset, 0
-
-    def write(self, data: bytes) -> None:
-        write_all(self._file, data)
-        self._size += len(data)
+        self._objects, self._path = objects, folder / f"{secrets.token_hex(12)}.part"
+        super().__init__(inputs, upload, seconds, FileIO(self._path, "w"))
 
     def save(self) -> float:
-        if not self._size:
+        size = self.offset - self.saved
+        if not size:
             return self._upload.expires_at
-        location = f"{UPLOADS}/{self._upload.id}/{self._start:016d}-{secrets.token_hex(6)}"
+        location = f"{UPLOADS}/{self._upload.id}/{self.saved:016d}-{secrets.token_hex(6)}"
         self._objects.put(self._path, location)
         try:
-            expires = self._inputs.advance_upload(self._upload.id, self._start, self._size, self._seconds, location)
+            expires = self._inputs.advance_upload(self._upload.id, self.saved, size, self._seconds, location)
         except (ConflictError, NotFoundError):
             self._objects.remove(location)
             raise
-        self._start += self._size
+        self.saved = self.offset
         self.discard()
         return expires
 
     def discard(self) -> None:
         self._file.seek(0)
         self._file.truncate()
-        self._size = 0
+        self.offset = self.saved
 
     def close(self) -> None:
-        self._file.close()
+        super().close()
         self._path.unlink(missing_ok=True)
