@@ -82,10 +82,8 @@ def kill(processes: Sequence[ProcessId], timeout: float = 10.0) -> None:
     """Kill processes of this machine, including suspended ones, and wait until they have ended."""
     alive = [process for identity in processes if (process := identity.find()) is not None]
     for process in alive:
-        try:
+        with contextlib.suppress(psutil.Error):
             process.kill()
-        except psutil.Error:
-            continue
     psutil.wait_procs(alive, timeout)
 
 

@@ -92,7 +92,7 @@ def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
             "API", [sys.executable, "-P", "-m", "api.http.server", "--fd", str(listener.fileno())], (listener.fileno(),)
         )
         dispatcher = _Child("dispatcher", [sys.executable, "-P", "-m", "service.scheduling.dispatcher"])
-        if subprocess.run([sys.executable, "-P", "-m", "service.ensure_network_weights"], check=False).returncode:
+        if subprocess.run([sys.executable, "-P", "-m", "service.prepare", "weights"], check=False).returncode:
             raise ServeError(
                 "No feature network is installed, so no job can run. `sgsst weights list` shows where to get one."
             )
