@@ -400,16 +400,10 @@ class _Form:
 
     def _end(self) -> None:
         if self._file is not None:
-            file, self._file = self._file, None
-            file.close()
-            try:
-                check_size(self._role, self._name, file.size)
-            except ServiceError:
-                file.discard()
-                raise
-            sha256 = self._blobs.add(file.path, self._receipt.id)
-            entry = {"role": self._role, "name": self._name, "sha256": sha256, "size": file.size}
+            sha256 = _keep(self._file, self._role, self._name, self._blobs, self._receipt)
+            entry = {"role": self._role, "name": self._name, "sha256": sha256, "size": self._file.size}
             self.received.files.append(entry)
+            self._file = None
             return
         text = self._text.decode("utf-8", "replace")
         if self._role not in _TEXT_FIELDS:
@@ -419,6 +413,13 @@ class _Form:
             raise problems.INVALID_REQUEST(f"The field {self._role!r} was sent twice. Send it once.")
         else:
             self.received.texts[self._role] = text
+
+
+def _keep(file: Receiver, role: str, name: str, blobs: Blobs, receipt: Receipt) -> str:
+    """Turn a complete file into a blob that the receipt holds, and return its SHA-256."""
+    file.close()
+    check_size(role, name, file.size)
+    return blobs.add(file.path, receipt.id)
 
 
 def most_files(settings: ServiceSettings) -> int:
@@ -596,7 +597,8 @@ class Fetcher:
                     state.left -= len(chunk)
                     self._check_size(0, state)
                     await run(_write, chunk, file, state.receipt)
-                sha256 = await run(self._keep, source, file, state.receipt, size=file.size)
+                name = staged_name(source.role, file_name(source.url))
+                sha256 = await run(_keep, file, source.role, name, self._blobs, state.receipt, size=file.size)
             except BaseException:
                 await self.threads.clean_up(run(file.discard))
                 raise
@@ -645,12 +647,6 @@ class Fetcher:
             raise problems.TOO_LARGE(
                 f"The inputs by URL have more than {limit:,} bytes. Upload large files.", limit=limit
             )
-
-    def _keep(self, source: _Input, file: Receiver, receipt: Receipt) -> str:
-        """Turn a complete file into a blob that the receipt holds, and return its SHA-256."""
-        file.close()
-        check_size(source.role, staged_name(source.role, file_name(source.url)), file.size)
-        return self._blobs.add(file.path, receipt.id)
 
     @contextmanager
     def _failures(self, source: _Input) -> Iterator[None]:
