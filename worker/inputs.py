@@ -584,27 +584,23 @@ def read_shared_scene(
     reader = homes.index(home())
     sharing = homes.count(home())
     together(collectives, lambda: _check_memory(path, collectives.rank, sharing, growth))
-    own: SceneFile | None = None
-    error: SgsstError | None = None
-    shared: _Shared | None = None
-    if collectives.rank == reader:
-        try:
-            own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth), spz_axes=spz_axes)
-            if sharing > 1 and hasattr(os, "memfd_create"):
-                own, shared = _share(own)
-        except SgsstError as raised:
-            error = raised
+    read = partial(read_scene, path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth), spz_axes=spz_axes)
+
+    def read_first() -> tuple[SceneFile | None, _Shared | None]:
+        """Read the scene if this rank does so for its machine, and share it with the others there."""
+        if collectives.rank != reader:
+            return None, None
+        file = read()
+        return _share(file) if sharing > 1 and hasattr(os, "memfd_create") else (file, None)
+
+    own, shared = together(collectives, read_first)
     try:
-        offers = collectives.all_gather((shared, error))
-        for _, problem in offers:
-            if problem is not None:
-                raise problem
-        offer = offers[reader][0]
+        offer = collectives.all_gather(shared)[reader]
         if own is None and offer is not None:
             with suppress(OSError):  # some systems hide even the user's own processes in /proc
                 own = _mapped(offer, f"/proc/{offer.process}/fd/{offer.descriptor}")
         if own is None:
-            own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth), spz_axes=spz_axes)
+            own = read()
         collectives.all_gather(None)  # barrier: the reader closes its memory file after all ranks have opened it
     finally:
         if shared is not None:
