@@ -334,10 +334,9 @@ class Leases:
             session.execute(update(JobRow).where(held).values(lease_expires_at=EXPIRED))
 
     def hold_gpus(self, lease: Lease, gpus: int) -> None:
-        """Set the number of GPUs that the attempt holds, and charge its usage so far to the job's owner."""
+        """Set the number of GPUs that the attempt holds from now on; the job's owner is charged for them at its end."""
         with self._held(lease) as (session, job, now):
             attempt = session.get_one(AttemptRow, (job.id, job.attempt))
-            _count_gpus(session, job, attempt, now)
             attempt.gpus, attempt.gpus_since = gpus, now
 
     # --- while the job runs ----------------------------------------------------------------------------------------
@@ -542,11 +541,6 @@ def _causes(session: Session, job: JobRow) -> list[Cause]:
     return [cause_of(error) for _, error in session.execute(newer.limit(_MAX_CAUSES)).all()]
 
 
-def _count_gpus(session: Session, job: JobRow, attempt: AttemptRow, now: float) -> None:
-    if attempt.gpus and attempt.gpus_since is not None:
-        add_usage(session, job.owner, now, gpu_seconds=attempt.gpus * max(0.0, now - attempt.gpus_since))
-
-
 def _close_attempt(
     session: Session, job: JobRow, outcome: AttemptOutcome, error: dict[str, Any] | None, now: float
 ) -> None:
@@ -554,7 +548,8 @@ def _close_attempt(
     if attempt is not None:
         attempt.finished_at, attempt.outcome, attempt.error = now, outcome, error
         if outcome != AttemptOutcome.LOST:  # its working time is unknown, and the loss is not the owner's fault
-            _count_gpus(session, job, attempt, now)
-            if not attempt.gpus:
+            if attempt.gpus_since is not None:
+                add_usage(session, job.owner, now, gpu_seconds=attempt.gpus * max(0.0, now - attempt.gpus_since))
+            else:
                 add_usage(session, job.owner, now, cpu_seconds=max(0.0, now - attempt.started_at))
     count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')

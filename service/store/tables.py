@@ -80,8 +80,7 @@ class JobRow(Base):
 class AttemptRow(Base):
     """Attempt at a job under one lease; `outcome` is None while it runs.
 
-    A running attempt has held `gpus` GPUs since `gpus_since`; earlier usage is already charged to its owner
-    (`UsageRow`).
+    It has held `gpus` GPUs since `gpus_since`; None without a GPU.
     """
 
     __tablename__ = "attempts"
