@@ -419,7 +419,7 @@ class Previews:
             image = render()
             if image is None:
                 return
-            save_jpg(_made(self._folder) / f"step_{step:07d}.jpg", image)
+            save_jpg(_created(self._folder) / f"step_{step:07d}.jpg", image)
         self._last = time.monotonic()
 
 
@@ -432,7 +432,7 @@ def _warning(warn: Warn, text: str) -> Iterator[None]:
         warn(f"{text}: {error}")
 
 
-def _made(folder: Path) -> Path:
+def _created(folder: Path) -> Path:
     """Create a folder if it does not exist, and return it."""
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -441,7 +441,7 @@ def _made(folder: Path) -> Path:
 def save_thumbnail(folder: Path, before: Tensor, after: Tensor) -> None:
     """Write the thumbnail of a job to its folder of previews, given two images [h, w, 3] of one view."""
     middle = before.shape[1] // 2
-    save_jpg(_made(folder) / _THUMBNAIL, torch.cat([before[:, :middle], after[:, middle:]], dim=1))
+    save_jpg(_created(folder) / _THUMBNAIL, torch.cat([before[:, :middle], after[:, middle:]], dim=1))
 
 
 def _shown_view(covered: Sequence[int]) -> int:
@@ -485,7 +485,7 @@ class LiveColors:
     def share_scene(self, scene: Scene) -> None:
         """Write the scene to which the colors belong (`scene.ply`), whose rows are not those of the job's input."""
         with _warning(self._warn, _NO_COLORS):
-            write_scene(_made(self._folder) / "scene.ply", scene)
+            write_scene(_created(self._folder) / "scene.ply", scene)
 
     def __call__(self, stylizer: Stylizer) -> None:
         """Write the colors after a step if enough time has passed since the last time."""
@@ -495,6 +495,6 @@ class LiveColors:
         with _warning(self._warn, _NO_COLORS):
             colors = stylizer.job.scene.sh_dc.clone()
             colors[stylizer.job.plan.seen] = stylizer.shown().cpu()
-            write_colors(_made(self._folder) / "colors.f16", colors)
+            write_colors(_created(self._folder) / "colors.f16", colors)
         now = time.monotonic()
         self._due = now + max(_COLOR_SECONDS, _COLOR_SHARE * (now - self._started), (now - started) / _COST_SHARE)
