@@ -9,11 +9,11 @@ import io
 import json
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
@@ -145,7 +145,7 @@ def convert(
     elif is_usd:
         write_usd(out, scene)
     else:
-        with _written(out, in_place=in_place) as stream:
+        with _written(out, in_place=in_place) as path, path.open("wb") as stream:
             encode_scene(stream, scene, result_format(out), out, pad_sh=pad_sh, axes=file.axes)
     stated = CLASSIC if is_usd else read_scene_header(out).tag.rendering
     if stated != scene.rendering:
@@ -184,20 +184,14 @@ def blend(parts: Sequence[tuple[SceneRequest, float]], out: Path, *, in_place: b
     ]
     blended = blend_scenes(files, [weight for _, weight in parts])
     out.parent.mkdir(parents=True, exist_ok=True)
-    with _written(out, in_place=in_place) as stream:
+    with _written(out, in_place=in_place) as path, path.open("wb") as stream:
         encode_blend(stream, blended, format, out)
     return about_losses(blended.scene, format, out)
 
 
-@contextmanager
-def _written(out: Path, *, in_place: bool) -> Iterator[BinaryIO]:
-    """Open a file to write, which replaces `out` at the end unless it is written in place."""
-    if in_place:
-        with out.open("wb") as stream:
-            yield stream
-        return
-    with atomic_path(out) as temporary, temporary.open("wb") as stream:
-        yield stream
+def _written(out: Path, *, in_place: bool) -> AbstractContextManager[Path]:
+    """Return the context of the path to write to, which replaces `out` at the end unless it is `out` itself."""
+    return nullcontext(out) if in_place else atomic_path(out)
 
 
 #: Largest relative difference of spherical harmonics that are those of the original times a factor.
@@ -253,8 +247,8 @@ def write_page(
     values = {"title": html.escape(title), "style": viewer["style"], "about": about}
     values |= {name: _base85(content) for name, content in data.items()}
     page = re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], viewer["document"])
-    with nullcontext(out) if in_place else atomic_path(out) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    with _written(out, in_place=in_place) as path:
+        path.write_text(page, encoding="utf-8")
 
 
 def _mean_up(cameras: Sequence[Camera]) -> list[float] | None:

@@ -13,7 +13,6 @@ from sqlalchemy import (
     ColumnElement,
     SQLColumnExpression,
     and_,
-    bindparam,
     case,
     delete,
     func,
@@ -29,7 +28,6 @@ from service.store.database import IDEMPOTENCY_SECONDS, Database, upsert
 from service.store.jobs import forget, holder_name, move, retention_of
 from service.store.tables import (
     ArtifactRow,
-    Base,
     BlobUseRow,
     CounterRow,
     DeliveryRow,
@@ -38,12 +36,6 @@ from service.store.tables import (
     JobRow,
     SecretRow,
 )
-
-_JOBS = Base.metadata.tables[JobRow.__tablename__]
-#: Live dispatchers: those with a heartbeat within a lease duration. A heartbeat far in the future comes from a wrong
-#: clock.
-_IS_ALIVE = DispatcherRow.seen_at.between(bindparam("since"), bindparam("until"))
-_ALIVE = select(func.count()).select_from(DispatcherRow).where(_IS_ALIVE)
 
 #: Whether a PostgreSQL server accepts no writes; a standby does not.
 _READ_ONLY = text("SHOW transaction_read_only")
@@ -93,9 +85,9 @@ class Operations:
 
     def dispatchers(self) -> list[DispatcherRow]:
         """Return the live dispatchers: those with a heartbeat within a lease duration."""
-        span = self._span()
+        alive = select(DispatcherRow).where(self._is_alive()).order_by(DispatcherRow.name)
         with self._database.reading() as session:
-            return list(session.scalars(select(DispatcherRow).where(_IS_ALIVE).order_by(DispatcherRow.name), span))
+            return list(session.scalars(alive))
 
     def check(self) -> int:
         """Query the database for a health check, and return the number of live dispatchers.
@@ -103,15 +95,16 @@ class Operations:
         Raises:
             DatabaseUnavailableError: If the database does not respond within some seconds, or accepts no writes.
         """
-        span = self._span()
+        alive = select(func.count()).select_from(DispatcherRow).where(self._is_alive())
         with self._database.reserved_connection() as connection:
             if not self._database.sqlite and connection.scalar(_READ_ONLY) == "on":
                 raise problems.DATABASE_UNAVAILABLE()
-            return connection.execute(_ALIVE, span).scalar_one()
+            return connection.execute(alive).scalar_one()
 
-    def _span(self) -> dict[str, float]:
+    def _is_alive(self) -> ColumnElement[bool]:
+        """Return the condition of a heartbeat within a lease duration. One far in the future is of a wrong clock."""
         now = self._database.clock()
-        return {"since": now - self._lease_seconds, "until": now + self._lease_seconds}
+        return DispatcherRow.seen_at.between(now - self._lease_seconds, now + self._lease_seconds)
 
     def counters(self) -> list[tuple[str, str, float]]:
         """Return name, labels and value of every counter."""
