@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from rich.table import Column, Table
@@ -20,7 +20,7 @@ from api.cli.options import local_path
 from api.static_files import FOLDER
 from sgsst_core.devices import seconds_left
 from sgsst_core.errors import SettingsError
-from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, write_json
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
@@ -46,9 +46,7 @@ from worker.painting import camera_named
 from worker.prepare import dry_run
 
 if TYPE_CHECKING:  # it imports matplotlib, for which the other commands need not wait
-    from sgsst_core.bench.variants import Curve, Quality, Variant
-
-T = TypeVar("T")
+    from sgsst_core.bench.variants import Curve, Quality
 
 # --- demo ----------------------------------------------------------------------------------------------------------
 
@@ -301,46 +299,32 @@ class VariantsRequest:
         return f"{self.source.scene.parent.name or self.source.scene.stem}, {self.style.stem}"
 
 
-@dataclass(frozen=True)
-class _Inputs:
-    """Contents of the files that a request names."""
+def _read_variants(request: VariantsRequest) -> tuple[SceneFile, dict[str, Any], dict[str, Any]]:
+    """Check and read the files of a request; the quick checks come first.
 
-    file: SceneFile
-    cameras: list[Camera]
-    style: Tensor
-    weights: BackboneWeights
-    variants: list[Variant]
+    Returns:
+        The scene's file, the arguments of `error_time` besides `progress`, and the request as a JSON object.
+    """
+    from sgsst_core.bench.variants import choose_variants
 
-    @staticmethod
-    def of(request: VariantsRequest) -> _Inputs:
-        """Check and read the files of a request; the quick checks come first."""
-        from sgsst_core.bench.variants import choose_variants
-
-        variants = choose_variants(request.variants)
-        weights = load_network_weights(request.backbone)
-        style = load_image(request.style)
-        file, capture = read_scene_and_capture(request.source)
-        ensure_writable_folder(request.out)
-        return _Inputs(file, capture.cameras, style, weights, variants)
-
-    def run(self, measure: Callable[..., T], request: VariantsRequest, progress: Any) -> T:
-        """Call `measure` with the arguments of `error_time`, and return its result."""
-        arguments = (self.file.scene, self.cameras, self.style, self.variants, request.seconds)
-        return measure(*arguments, weights=self.weights, progress=progress, **request.settings)
-
-    def as_dict(self, request: VariantsRequest) -> dict[str, Any]:
-        """Return the request as a JSON object."""
-        return {
-            "version": 1,
-            "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
-            "style": request.style.name,
-            "views": len(self.cameras),
-            "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in self.cameras})],
-            "budget_seconds": request.seconds,
-            "settings": request.settings,
-            "backbone": self.weights.name,
-            "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
-        }
+    variants = choose_variants(request.variants)
+    weights = load_network_weights(request.backbone)
+    style = load_image(request.style)
+    file, capture = read_scene_and_capture(request.source)
+    ensure_writable_folder(request.out)
+    read = {"scene": file.scene, "cameras": capture.cameras, "style": style, "variants": variants, "weights": weights}
+    described = {
+        "version": 1,
+        "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
+        "style": request.style.name,
+        "views": len(capture.cameras),
+        "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in capture.cameras})],
+        "budget_seconds": request.seconds,
+        "settings": request.settings,
+        "backbone": weights.name,
+        "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
+    }
+    return file, {**read, "seconds": request.seconds, **request.settings}, described
 
 
 def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
@@ -356,8 +340,7 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
     """
     from sgsst_core.bench.variants import as_dict, error_time, write_plot
 
-    inputs = _Inputs.of(request)
-    described = inputs.as_dict(request)
+    file, arguments, described = _read_variants(request)
     measured: dict[str, Curve] = {}
 
     def write(curves: Sequence[Curve]) -> None:
@@ -368,12 +351,12 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
         write(list(measured.values()))
         progress(curve)
 
-    curves = inputs.run(error_time, request, evaluated)
+    curves = error_time(**arguments, progress=evaluated)
     write(curves)
     write_plot(request.out / "error_time.png", curves, request.title)
     for curve in curves:
         if curve.sh_dc is not None:
-            write_stylized(inputs.file, request.out / f"{curve.variant.name}.ply", curve.sh_dc)
+            write_stylized(file, request.out / f"{curve.variant.name}.ply", curve.sh_dc)
     return curves
 
 
@@ -384,14 +367,14 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
     """
     from sgsst_core.bench.variants import compare_quality, write_plot, write_quality_plot, write_sheet
 
-    inputs = _Inputs.of(request)
-    quality = inputs.run(compare_quality, request, progress)
-    write_json(request.out / "quality.json", {**inputs.as_dict(request), **quality.as_dict()})
+    file, arguments, described = _read_variants(request)
+    quality = compare_quality(**arguments, progress=progress)
+    write_json(request.out / "quality.json", {**described, **quality.as_dict()})
     write_quality_plot(request.out / "quality.png", quality, request.title)
     write_plot(request.out / "error_time.png", quality.curves, request.title)
     write_sheet(request.out / "quality.jpg", quality)
     for outcome in quality.outcomes[1:]:
-        write_stylized(inputs.file, request.out / f"{outcome.name}.ply", outcome.sh_dc)
+        write_stylized(file, request.out / f"{outcome.name}.ply", outcome.sh_dc)
     return quality
 
 
