@@ -14,8 +14,7 @@ read from codebooks is written without further loss.
 A streamed SOG is read at its finest level, and written with other colors. lod-meta.json lists SOG scenes in folders of
 their own, each with Gaussians of one level of detail, and has a tree whose leaves refer to ranges of them. The layout
 is that of https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog; early files lack its
-version and counts. The environment, which is drawn beside any level, is part of the scene. All files may be in a ZIP
-archive.
+version. The environment, which is drawn beside any level, is part of the scene. All files may be in a ZIP archive.
 """
 
 from __future__ import annotations
@@ -33,14 +32,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import IO, Any, BinaryIO, NamedTuple
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.constants import SH_DEGREES
-from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.errors import OutputError, SceneError, reading_scene
 from sgsst_core.files.advice import SCENES, converted, known_kind, refuse_changed_meaning
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
@@ -71,120 +70,36 @@ ZIP_MAGIC = b"PK\x03\x04"
 _END = struct.Struct("<4s4H2LH")
 _END_MAGIC, _LOCATOR_MAGIC, _LOCATOR_BYTES = b"PK\x05\x06", b"PK\x06\x07", 20
 _MAX_COMMENT_BYTES = 1 << 16
-#: Maximum number of files in the archive of a scene, and bytes of their list.
-_MAX_ENTRIES = 256
-_MAX_DIRECTORY_BYTES = 1 << 18
+#: Maximum bytes of the list of an archive's files.
+_MAX_LIST_BYTES = 1 << 21
 
 
-class FilesOfScene:
-    """Files of a scene: those of an archive, or those beside one of them.
+def archive_end(path: Path) -> tuple[bytes, tuple[str, ...]]:
+    """Read the end of an archive, before its list of files is parsed.
 
-    Args:
-        path: Path of the archive, or of a file in the folder.
-        folder: Prefix of all names, such as "0_0/".
-        archive: Archive that is open already; None opens it for each file.
-
-    Attributes:
-        surplus: Note on bytes before or after the archive.
-    """
-
-    def __init__(self, path: Path, folder: str = "", archive: zipfile.ZipFile | None = None) -> None:
-        self.path, self.folder, self._archive = path, folder, archive
-        self.is_archived = read_bytes(path, 0, 4) == ZIP_MAGIC
-        self.surplus: tuple[str, ...] = ()
-        if self.is_archived and archive is None:
-            end = archive_end(path)
-            if end.entries > _MAX_ENTRIES or end.list_bytes > _MAX_DIRECTORY_BYTES:
-                raise SceneError(f"{path}: is a ZIP archive of {end.entries} files, so no SOG scene. Unpack it first.")
-            self.surplus = end.surplus
-
-    def size(self, name: str) -> int:
-        """Return an upper bound for the bytes of a file: its size, or that of the archive, whose list may be wrong."""
-        try:
-            return (self.path if self.is_archived else self.path.parent / (self.folder + name)).stat().st_size
-        except OSError as error:
-            raise self._unreadable(name, error) from error
-
-    def load(self, name: str, limit: int, *, whole: bool = True) -> bytes:
-        """Return the content of a file of at most `limit` bytes, or its first `limit` bytes if `whole` is False."""
-        where = self.folder + name
-        try:
-            with self._open(where) as file:
-                data = file.read(limit + whole)
-        except KeyError as error:
-            if self._archive is not None:
-                raise SceneError(f"{self.path}: {where} is missing. Archive or export the scene again.") from error
-            raise SceneError(
-                f"{self.path}: is a ZIP archive without {name}, so no SOG scene. Unpack it, and give the scene in it."
-            ) from error
-        except OSError as error:
-            raise self._unreadable(name, error) from error
-        except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, struct.error) as error:
-            raise SceneError(f"{self.path}: {where} is damaged: {error}. Copy or export the scene again.") from error
-        if len(data) > limit:
-            raise SceneError(
-                f"{self.path}: {where} has more than {limit} bytes, too many for this scene. Export it again."
-            )
-        return data
-
-    def _unreadable(self, name: str, error: OSError) -> SceneError:
-        return SceneError(
-            f"{self.path}: {self.folder}{name} cannot be read: {error.strerror}. Give the whole folder, or an archive."
-        )
-
-    @contextmanager
-    def _open(self, name: str) -> Iterator[IO[bytes]]:
-        if not self.is_archived:
-            with (self.path.parent / name).open("rb") as file:
-                yield file
-        elif self._archive is not None:
-            with _opened_member(self._archive, name) as file:
-                yield file
-        else:
-            with zipfile.ZipFile(self.path) as archive, _opened_member(archive, name) as file:
-                yield file
-
-
-def _opened_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
-    if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise zipfile.BadZipFile("its compression is not supported")
-    return archive.open(name)
-
-
-class ArchiveEnd(NamedTuple):
-    """Statement at the end of an archive.
-
-    Attributes:
-        list_start, list_bytes: Position of their list, and its size.
-        surplus: Note on bytes before or after the archive.
-    """
-
-    entries: int
-    list_start: int
-    list_bytes: int
-    surplus: tuple[str, ...]
-
-
-def archive_end(path: Path) -> ArchiveEnd:
-    """Read the end of an archive, before its list of files is read.
+    Returns:
+        List of files, not parsed, and the note on bytes before or after the archive.
 
     Raises:
-        SceneError: If it is truncated, or larger than 4 GB.
+        SceneError: If it is truncated, larger than 4 GB, or lists too many files.
     """
     with path.open("rb") as file:
         size = file.seek(0, io.SEEK_END)
         file.seek(max(0, size - _LOCATOR_BYTES - _END.size - _MAX_COMMENT_BYTES))
         tail = file.read()
-    position = tail.rfind(_END_MAGIC)
-    if position < 0 or position + _END.size > len(tail):
-        raise SceneError(f"{path}: is a truncated ZIP archive. Copy or export the scene again.")
-    entries, list_bytes, list_offset, comment_bytes = _END.unpack_from(tail, position)[4:]
-    if tail[max(0, position - _LOCATOR_BYTES) : position].startswith(_LOCATOR_MAGIC):
-        raise SceneError(f"{path}: is a ZIP archive of more than 4 GB, which cannot be read. Unpack it first.")
-    list_start = size - len(tail) + position - list_bytes
+        position = tail.rfind(_END_MAGIC)
+        if position < 0 or position + _END.size > len(tail):
+            raise SceneError(f"{path}: is a truncated ZIP archive. Copy or export the scene again.")
+        entries, list_bytes, list_offset, comment_bytes = _END.unpack_from(tail, position)[4:]
+        if tail[max(0, position - _LOCATOR_BYTES) : position].startswith(_LOCATOR_MAGIC):
+            raise SceneError(f"{path}: is a ZIP archive of more than 4 GB, which cannot be read. Unpack it first.")
+        if list_bytes > _MAX_LIST_BYTES:
+            raise SceneError(f"{path}: is a ZIP archive of {entries} files, so no SOG scene. Unpack it first.")
+        list_start = size - len(tail) + position - list_bytes
+        file.seek(max(0, list_start))
+        names = file.read(list_bytes)
     after = without_padding(tail[position + _END.size + comment_bytes :])
-    surplus = about_surplus(max(0, list_start - list_offset) + len(after), "byte")
-    return ArchiveEnd(entries, max(0, list_start), list_bytes, surplus)
+    return names, about_surplus(max(0, list_start - list_offset) + len(after), "byte")
 
 
 #: Number of values of a codebook, one per byte.
@@ -404,12 +319,63 @@ class SogHeader(SceneHeader):
     vectors: int | None
 
 
-class SogFiles(FilesOfScene):
-    """Files of a SOG scene, or of a part of a streamed SOG."""
+class SogFiles:
+    """Files of a SOG scene, of a streamed SOG, or of a part of one: those of an archive, or those in a folder.
+
+    Args:
+        path: Path of the archive, or of a file in the folder.
+        archive: Open archive; None for a folder.
+        folder: Prefix of all names, such as "0_0/".
+        surplus: Note on bytes before or after the archive.
+    """
+
+    def __init__(
+        self, path: Path, archive: zipfile.ZipFile | None = None, folder: str = "", surplus: tuple[str, ...] = ()
+    ) -> None:
+        self.path, self.archive, self.folder, self.surplus = path, archive, folder, surplus
+
+    def part(self, folder: str) -> SogFiles:
+        """Return the files with a further prefix."""
+        return SogFiles(self.path, self.archive, self.folder + folder, self.surplus)
+
+    def size(self, name: str) -> int:
+        """Return an upper bound for the bytes of a file: its size, or that of the archive, whose list may be wrong."""
+        with reading_scene(self.path):
+            return (self.path if self.archive else self.path.parent / (self.folder + name)).stat().st_size
+
+    def load(self, name: str, limit: int, *, whole: bool = True) -> bytes:
+        """Return the content of a file of at most `limit` bytes, or its first `limit` bytes if `whole` is False."""
+        where = self.folder + name
+        try:
+            with self._open(where) as file:
+                data = file.read(limit + whole)
+        except KeyError as error:
+            raise SceneError(
+                f"{self.path}: is a ZIP archive without {where}, so no SOG scene. Unpack it and give the scene in it, "
+                "or export the scene again."
+            ) from error
+        except OSError as error:
+            raise SceneError(
+                f"{self.path}: {where} cannot be read: {error.strerror}. Give the whole folder, or an archive."
+            ) from error
+        except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, struct.error) as error:
+            raise SceneError(f"{self.path}: {where} is damaged: {error}. Copy or export the scene again.") from error
+        if len(data) > limit:
+            raise SceneError(
+                f"{self.path}: {where} has more than {limit} bytes, too many for this scene. Export it again."
+            )
+        return data
+
+    def _open(self, where: str) -> IO[bytes]:
+        if self.archive is None:
+            return (self.path.parent / where).open("rb")
+        if self.archive.getinfo(where).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise zipfile.BadZipFile("its compression is not supported")
+        return self.archive.open(where)
 
     def meta(self) -> bytes:
         """Return the content of meta.json."""
-        name = META_NAME if self.is_archived or self.folder else self.path.name
+        name = META_NAME if self.archive or self.folder else self.path.name
         return self.load(name, _MAX_PART_META_BYTES if self.folder else _MAX_META_BYTES)
 
     def dimensions(self, name: str, least: int, most: int | None = None) -> tuple[int, int]:
@@ -465,8 +431,24 @@ def _matches(start: FileStart) -> bool:
     return archive or (head.lstrip().startswith(b"{") and b'"means"' in head)
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[SogFiles]:
+    """Yield the files of a scene, given an archive, or a file in a folder."""
+    if read_bytes(path, 0, 4) != ZIP_MAGIC:
+        yield SogFiles(path)
+        return
+    _, surplus = archive_end(path)
+    try:
+        archive = zipfile.ZipFile(path)
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
+        raise SceneError(f"{path}: is a damaged ZIP archive: {error}. Copy or export the scene again.") from error
+    with archive:
+        yield SogFiles(path, archive, surplus=surplus)
+
+
 def _read_header(start: FileStart) -> SogHeader:
-    return sog_header(SogFiles(start.path))
+    with _opened(start.path) as files:
+        return sog_header(files)
 
 
 def sog_header(files: SogFiles) -> SogHeader:
@@ -557,7 +539,8 @@ def _steps(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
 
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     assert isinstance(header, SogHeader)
-    read_sog(SogFiles(file.path), header, into)
+    with _opened(file.path) as files:
+        read_sog(files, header, into)
 
 
 def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> None:
@@ -727,8 +710,8 @@ SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write, limit
 #: Name of the index in a folder or an archive.
 INDEX_NAME = "lod-meta.json"
 _MAX_INDEX_BYTES = 1 << 21
-#: Maximum bytes of the list of an archive's files, and number of SOG scenes; usual ones have half a million Gaussians.
-_MAX_LIST_BYTES, _MAX_PARTS = 1 << 21, 1024
+#: Maximum number of SOG scenes; usual ones have half a million Gaussians.
+_MAX_PARTS = 1024
 #: Path of the meta.json of a part: in folders below the index, so that no other files are read.
 _PART = re.compile(rf"((?:[\w-][\w.-]{{0,99}}/){{1,4}}){re.escape(META_NAME)}")
 
@@ -760,39 +743,16 @@ class StreamedHeader(SceneHeader):
         return [(part, slice(*span)) for part, span in zip(self.parts, pairwise(self.ends), strict=False)]
 
 
-class _Opened:
-    """Open streamed SOG.
-
-    Attributes:
-        surplus: Note on bytes around an archive.
-    """
-
-    def __init__(self, path: Path, archive: zipfile.ZipFile | None) -> None:
-        self._path, self._archive, self._above = path, archive, ""
-        self.surplus: tuple[str, ...] = ()
-        if archive is not None:
-            names = [name for name in archive.namelist() if f"/{name}".endswith(f"/{INDEX_NAME}")]
-            self._above = min(names, key=len, default="").removesuffix(INDEX_NAME)  # an archive may hold the folder
-            self.surplus = archive_end(path).surplus
-        name = INDEX_NAME if archive is not None else path.name
-        self.index = FilesOfScene(path, self._above, archive).load(name, _MAX_INDEX_BYTES)
-
-    def part(self, folder: str) -> SogFiles:
-        """Return the files of a part."""
-        return SogFiles(self._path, self._above + folder, self._archive)
-
-
 @contextmanager
-def _opened(path: Path) -> Iterator[_Opened]:
-    if read_bytes(path, 0, 4) != ZIP_MAGIC:
-        yield _Opened(path, None)
-        return
-    try:
-        archive = zipfile.ZipFile(path)
-    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
-        raise SceneError(f"{path}: is a damaged ZIP archive: {error}. Copy or export the scene again.") from error
-    with archive:
-        yield _Opened(path, archive)
+def _opened_levels(path: Path) -> Iterator[tuple[SogFiles, bytes]]:
+    """Yield the files of a streamed SOG, and its index."""
+    with _opened(path) as files:
+        name = path.name
+        if files.archive is not None:
+            names = [each for each in files.archive.namelist() if f"/{each}".endswith(f"/{INDEX_NAME}")]
+            above = min(names, key=len, default="").removesuffix(INDEX_NAME)  # an archive may hold the folder
+            files, name = files.part(above), INDEX_NAME
+        yield files, files.load(name, _MAX_INDEX_BYTES)
 
 
 def _matches_streamed(start: FileStart) -> bool:
@@ -801,30 +761,27 @@ def _matches_streamed(start: FileStart) -> bool:
     if known_kind(start.path, start.head, SCENES):
         return False
     try:
-        end = archive_end(start.path)
+        return INDEX_NAME.encode() in archive_end(start.path)[0]
     except SceneError:  # raised again by the reader of SOG
         return False
-    names = read_bytes(start.path, end.list_start, end.list_start + min(end.list_bytes, _MAX_LIST_BYTES + 1))
-    return len(names) <= _MAX_LIST_BYTES and INDEX_NAME.encode() in names
 
 
 def _read_streamed_header(start: FileStart) -> StreamedHeader:
-    with _opened(start.path) as opened:
+    with _opened_levels(start.path) as (files, text):
         try:
-            index = json.loads(opened.index)
-            folders = _levels(index)
+            folders = _levels(json.loads(text))
         except WRONG_JSON as error:
             raise SceneError(
                 f"{start.path}: {INDEX_NAME} is not that of a streamed SOG ({repr(error)[:200]}). Export the scene "
                 "again."
             ) from error
-        parts = [_part(start.path, opened, folder, *entry) for folder, entry in folders.items()]
+        parts = [_part(files, folder, *entry) for folder, entry in folders.items()]
     levels = sorted({part.level for part in parts if part.level is not None})
     if not levels:
         raise SceneError(f"{start.path}: {INDEX_NAME} refers to no Gaussians. Export the scene again.")
     scene = [part for part in parts if part.level in (levels[0], None)]
     ends = (0, *accumulate(part.header.count for part in scene))
-    if read_bytes(start.path, 0, 4) == ZIP_MAGIC and ends[-1] > GAUSSIANS_PER_BYTE * start.size:
+    if files.archive and ends[-1] > GAUSSIANS_PER_BYTE * start.size:
         raise SceneError(f"{start.path}: declares {ends[-1]} Gaussians, more than it can hold. Export the scene again.")
     notes = (f"the finest of {len(levels)} levels of detail is read; a .zip of it has all of them, with its colors",)
     return StreamedHeader(
@@ -833,7 +790,7 @@ def _read_streamed_header(start: FileStart) -> StreamedHeader:
         max(part.header.coefficients for part in scene),
         (*scene, *(part for part in parts if part.level not in (levels[0], None))),
         ends,
-        notes=opened.surplus + (notes if len(levels) > 1 else ()),
+        notes=files.surplus + (notes if len(levels) > 1 else ()),
         tag=scene[0].header.tag,
     )
 
@@ -858,12 +815,6 @@ def _levels(index: dict[str, Any]) -> dict[str, tuple[int | None, list[tuple[int
             if not all(type(value) is int and value >= 0 for value in numbers) or not 0 <= int(level) < most:
                 raise ValueError(f"level {level} of {most}: {range_}")
             ranges[_folder(names[file]), int(level)].append((offset, count))
-    totals: dict[int, int] = defaultdict(int)
-    for (_, own), spans in ranges.items():
-        totals[own] += sum(size for _, size in spans)
-    for own, count in enumerate(index.get("counts", [])):
-        if totals[own] != count:
-            raise ValueError(f"level {own} has {totals[own]} Gaussians in place of {count}")
     order = {name: number for number, name in enumerate(map(_folder, names))}
     parts: dict[str, tuple[int | None, list[tuple[int, int]]]] = {
         folder: (level, spans) for (folder, level), spans in sorted(ranges.items(), key=lambda item: order[item[0][0]])
@@ -886,29 +837,29 @@ def _folder(name: str) -> str:
     return match[1]
 
 
-def _part(path: Path, opened: _Opened, folder: str, level: int | None, ranges: list[tuple[int, int]]) -> _Part:
+def _part(files: SogFiles, folder: str, level: int | None, ranges: list[tuple[int, int]]) -> _Part:
     """Return a part, after checking that the tree refers to each of its Gaussians once."""
-    header = sog_header(opened.part(folder))
+    header = sog_header(files.part(folder))
     end = 0
     for offset, count in sorted(ranges):
         end = end + count if offset == end else -1
     if level is not None and end != header.count:
         raise SceneError(
-            f"{path}: {folder}{META_NAME} has {header.count} Gaussians, but {INDEX_NAME} does not refer to each once. "
-            "Export the scene again."
+            f"{files.path}: {folder}{META_NAME} has {header.count} Gaussians, but {INDEX_NAME} does not refer to each "
+            "once. Export the scene again."
         )
     return _Part(folder, level, header)
 
 
 def _read_streamed(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
     assert isinstance(header, StreamedHeader)
-    with _opened(file.path) as opened:
+    with _opened_levels(file.path) as (files, _):
         for part, rows in header.rows:
             arrays = {name: array[rows] for name, array in into.items()}
             if "sh_rest" in arrays:
                 arrays["sh_rest"][:, part.header.coefficients :] = 0
                 arrays["sh_rest"] = arrays["sh_rest"][:, : part.header.coefficients]
-            read_sog(opened.part(part.folder), part.header, arrays)
+            read_sog(files.part(part.folder), part.header, arrays)
     notes = (note for part, _ in header.rows for note in part.header.notes)
     return replace(header, notes=tuple(dict.fromkeys((*header.notes, *notes))))
 
@@ -920,12 +871,12 @@ def pack(index: Path, target: Path) -> None:
         SceneError: If it is no streamed SOG, or a file is missing.
     """
     header = _read_streamed_header(FileStart(index, b"", index.stat().st_size))
-    with _opened(index) as opened, zipfile.ZipFile(target, "w") as archive:
+    with _opened_levels(index) as (files, text), zipfile.ZipFile(target, "w") as archive:
         for part in header.parts:
             unchanged = np.zeros((part.header.count, 3), np.float32)
-            for name, data in recolored(opened.part(part.folder), part.header, unchanged).items():
+            for name, data in recolored(files.part(part.folder), part.header, unchanged).items():
                 archive.writestr(zipfile.ZipInfo(part.folder + name), data)
-        archive.writestr(zipfile.ZipInfo(INDEX_NAME), opened.index)
+        archive.writestr(zipfile.ZipInfo(INDEX_NAME), text)
 
 
 def write_recolored(
@@ -951,11 +902,11 @@ def write_recolored(
     """
     from scipy.spatial import cKDTree
 
-    with _opened(original) as opened:
+    with _opened_levels(original) as (files, text):
         own: Arrays = {name: np.empty((header.count, 3), np.float32) for name in ("means", "sh_dc")}
         for part, rows in header.rows:
-            read_positions(opened.part(part.folder), part.header, own["means"][rows])
-            read_colors(opened.part(part.folder), part.header, own["sh_dc"][rows])
+            read_positions(files.part(part.folder), part.header, own["means"][rows])
+            read_colors(files.part(part.folder), part.header, own["sh_dc"][rows])
         if not np.array_equal(means, own["means"]):
             raise OutputError(
                 f"the scene's Gaussians are not those of the finest level of {original}, in the same order. Give that "
@@ -964,16 +915,16 @@ def write_recolored(
         change, tree = colors - own["sh_dc"], cKDTree(means)
         rows_of = {part.folder: rows for part, rows in header.rows}
         for part in header.parts:
-            files = opened.part(part.folder)
+            own_files = files.part(part.folder)
             if part.folder in rows_of:
                 changed = change[rows_of[part.folder]]
             else:
                 positions = np.empty((part.header.count, 3), np.float32)
-                read_positions(files, part.header, positions)
+                read_positions(own_files, part.header, positions)
                 changed = change[tree.query(np.nan_to_num(positions))[1]]
-            for name, data in recolored(files, part.header, changed).items():
+            for name, data in recolored(own_files, part.header, changed).items():
                 archive.writestr(zipfile.ZipInfo(part.folder + name), data)
-        archive.writestr(zipfile.ZipInfo(INDEX_NAME), opened.index)
+        archive.writestr(zipfile.ZipInfo(INDEX_NAME), text)
 
 
 STREAMED_SOG = SceneFormat(

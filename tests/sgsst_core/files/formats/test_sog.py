@@ -211,7 +211,7 @@ def many_channels() -> bytes:
     [
         (many_channels(), "100000 values in place of 3 numbers"),
         (zipped({"a.txt": b"text"}), "a ZIP archive without meta.json, so no SOG scene"),
-        (zipped({f"{i}": b"" for i in range(300)}), "a ZIP archive of 300 files"),
+        (zipped({f"{i:0200}": b"" for i in range(9000)}), "a ZIP archive of 9000 files"),
         (zipped(by_hand(2))[:-30], "truncated ZIP archive"),
         (b"PK\x03\x04" + bytes(100), "truncated ZIP archive"),
         (zipped({"meta.json": b"[" * 100_000}), "not that of a SOG scene"),
@@ -369,7 +369,6 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "deep tree": (lambda index: index.update(tree="DEEP"), "not that of a streamed SOG"),  # deeper than Python's parser
     "no leaves": (lambda index: index["tree"].update(children=[]), "refers to no Gaussians"),
     "version": (lambda index: index.update(version=2), "version: 2"),
-    "counts": (lambda index: index.update(counts=[1, 90, 20]), "level 0 has 500 Gaussians in place of 1"),
     "many files": (lambda index: index.update(filenames=["0_0/meta.json"] * 2000), "2000 files"),
     "level": (lambda index: index.update(lodLevels=2), "level 2 of 2"),
     "two levels": (lambda index: leaf(index, 0)["lods"].update({"1": leaf(index, 0)["lods"]["0"]}), "several levels"),
