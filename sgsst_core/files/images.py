@@ -1,7 +1,7 @@
 """Readers and writers of images as float32 tensors [H, W, 3] of sRGB values in 0..1.
 
-Pillow refuses PNGs with color profiles or compressed texts of more than 1 MiB, and finds metadata that follow the
-pixels only by decoding all of them. It therefore gets a PNG's pixels with the metadata that are used, and no others.
+Pillow finds metadata that follow the pixels of a PNG only by decoding all of them. It therefore gets a PNG's metadata
+first, as far as they are used, and then its pixels.
 
 Colors are converted to sRGB by ICC profiles, or by those that a PNG's color chunks describe.
 """
@@ -18,14 +18,13 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageCms, ImageOps, PngImagePlugin, UnidentifiedImageError
 from torch import Tensor
 
 from sgsst_core.errors import ImageError
@@ -63,16 +62,15 @@ _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 #: Markers without a segment: TEM, restarts and the start of the image.
 _BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-#: Maximum length of all compressed texts together.
-MAX_TEXT_BYTES = 16 << 20
+#: Maximum length of a compressed text or profile of a PNG; Pillow's own limit, 1 MiB, is too low for some profiles.
+PngImagePlugin.MAX_TEXT_CHUNK = 16 << 20
 #: Chunks before the pixels that determine them, or the number of frames.
 _COPIED = (b"IHDR", b"PLTE", b"tRNS", b"acTL", b"fcTL")
 #: Chunks that state colors without a profile.
 _COLOR_CHUNKS = (b"cICP", b"sRGB", b"gAMA", b"cHRM")
-#: Texts that may hold the orientation.
-_USED_TEXTS = (b"XML:com.adobe.xmp", b"Raw profile type exif")
-#: Additional bytes of a compressed value that is as long as the limit.
-_OVERHEAD = 1 << 16
+#: Other chunks that are used, and texts that may hold the orientation.
+_METADATA, _TEXTS = (b"eXIf", b"iCCP"), (b"tEXt", b"zTXt", b"iTXt")
+_USED_TEXTS = (b"XML:com.adobe.xmp\0", b"Raw profile type exif\0")
 _PNG_END = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
 
 
@@ -197,13 +195,13 @@ def _opened(path: Path, *, pixels: bool = True) -> Iterator[Image.Image]:
     try:
         with path.open("rb") as file:
             is_png = file.read(len(_PNG_SIGNATURE)) == _PNG_SIGNATURE
-        source, profile = _open_png(path, pixels=pixels) if is_png else (path, None)
+        source, colors = _open_png(path, pixels=pixels) if is_png else (path, {})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
             opened = Image.open(source, formats=[*FORMATS, *_heif_format(path)])
         with opened as image:
-            if profile is not None:
-                image.info["icc_profile"] = profile
+            if is_png and (b"cICP" in colors or not image.info.get("icc_profile")):
+                image.info["icc_profile"] = colors
             if image.width * image.height > MAX_PIXELS:
                 raise Image.DecompressionBombError
             yield image
@@ -330,36 +328,22 @@ def to_image(image: Tensor) -> Image.Image:
     return Image.fromarray(values.numpy())
 
 
-@dataclass
-class _PngMetadata:
-    """Metadata of a file.
+def _open_png(path: Path, *, pixels: bool) -> tuple[io.BytesIO, dict[bytes, bytes]]:
+    """Return a PNG for Pillow, and the contents of the chunks that state its colors without a profile.
 
-    Attributes:
-        chunks: Chunks for Pillow, complete.
-        profile: Color profile, of which at most one byte more than allowed is inflated; None if there is none.
-        colors: Contents of the chunks that state colors without a profile.
-        text_left: Bytes of compressed texts that are still allowed.
-    """
-
-    chunks: list[bytes] = field(default_factory=list)
-    profile: bytes | None = None
-    colors: dict[bytes, bytes] = field(default_factory=dict)
-    text_left: int = MAX_TEXT_BYTES
-
-
-def _open_png(path: Path, *, pixels: bool) -> tuple[io.BytesIO, bytes | dict[bytes, bytes]]:
-    """Return a PNG for Pillow, and its color profile, or the chunks that state its colors without one.
+    Of each kind of metadata, the last chunk counts.
 
     Args:
         path: File that starts with `_PNG_SIGNATURE`.
         pixels: Whether the pixels are needed; without them, the file is only good for its header.
 
     Raises:
-        ImageError: If the file has too much compressed text.
         ValueError: If a chunk is beyond the end of the file.
         OSError: If the file cannot be read.
     """
-    metadata, start, stop = _PngMetadata(), 0, 0
+    chunks, start, stop = [_PNG_SIGNATURE], 0, 0
+    colors: dict[bytes, bytes] = {}
+    metadata: dict[bytes, bytes] = {}
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         position = file.seek(len(_PNG_SIGNATURE))
@@ -374,57 +358,18 @@ def _open_png(path: Path, *, pixels: bool) -> tuple[io.BytesIO, bytes | dict[byt
                 break
             elif stop_of_chunk > size:
                 raise ValueError("its header is incomplete")
+            elif kind in _COLOR_CHUNKS:
+                colors[kind] = file.read(min(length, 32))
             elif kind in _COPIED and not start:
-                metadata.chunks.append(header + file.read(length + 4))
-            else:
-                _read_chunk(path, kind, length, file, metadata)
+                chunks.append(header + file.read(length + 4))
+            elif kind in _METADATA or (kind in _TEXTS and file.read(32).startswith(_USED_TEXTS)):
+                file.seek(position)
+                metadata[kind] = file.read(length + 12)
             position = stop_of_chunk
         file.seek(start)
         data = file.read(stop - start if pixels else 8) if start else b""
     end = _PNG_END if start and stop <= size else b""
-    profile = metadata.colors if b"cICP" in metadata.colors else metadata.profile or metadata.colors
-    return io.BytesIO(b"".join([_PNG_SIGNATURE, *metadata.chunks, data, end])), profile
-
-
-def _read_chunk(path: Path, kind: bytes, length: int, file: BinaryIO, metadata: _PngMetadata) -> None:
-    """Read EXIF data, a color profile, or a text that may hold the orientation; other chunks are skipped."""
-    if kind == b"eXIf":
-        metadata.chunks.append(_chunk(kind, b"", file.read(length)))
-    elif kind == b"iCCP":
-        value = file.read(min(length, MAX_PROFILE_BYTES + _OVERHEAD)).partition(b"\0")[2]
-        metadata.profile = _inflated(value[1:], MAX_PROFILE_BYTES) or metadata.profile
-    elif kind in _COLOR_CHUNKS:
-        metadata.colors[kind] = file.read(min(length, 32))
-    elif kind in (b"tEXt", b"zTXt", b"iTXt"):
-        keyword, _, value = file.read(min(length, MAX_TEXT_BYTES + _OVERHEAD)).partition(b"\0")
-        compressed = kind == b"zTXt"
-        if kind == b"iTXt":
-            compressed, value = value[:1] == b"\1", value[2:].partition(b"\0")[2].partition(b"\0")[2]
-        elif compressed:
-            value = value[1:]
-        if compressed:
-            value = _inflated(value, metadata.text_left) or b""
-            metadata.text_left -= len(value)
-        if metadata.text_left < 0:
-            raise ImageError(
-                f"{path}: holds more than {MAX_TEXT_BYTES >> 20} MiB of compressed text. Save it without its metadata."
-            )
-        if keyword in _USED_TEXTS and len(value) <= MAX_TEXT_BYTES:
-            xmp = keyword == _USED_TEXTS[0]
-            metadata.chunks.append(_chunk(*(b"iTXt", keyword + bytes(5)) if xmp else (b"tEXt", keyword + b"\0"), value))
-
-
-def _inflated(data: bytes, limit: int) -> bytes | None:
-    """Return inflated data, at most one byte more than a limit; None if it is broken."""
-    try:
-        return zlib.decompressobj().decompress(data, limit + 1)
-    except zlib.error:
-        return None
-
-
-def _chunk(kind: bytes, head: bytes, value: bytes) -> bytes:
-    data = head + value
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return io.BytesIO(b"".join([*chunks, *metadata.values(), data, end])), colors
 
 
 #: Maximum size of a profile in bytes. Those of printing processes have up to 3 MB.

@@ -249,8 +249,9 @@ def jpeg_of_scans(count: int) -> bytes:
 
 
 def text_bomb() -> bytes:
-    """Return a small PNG with a compressed comment that expands to 200 MB."""
-    return png(16, 16, chunk(b"zTXt", b"Comment\0\0" + zeros(200 * MB)), chunk(b"IDAT", zeros(49 * 16)))
+    """Return a small PNG with compressed XMP data that expand to 200 MB."""
+    xmp = chunk(b"iTXt", b"XML:com.adobe.xmp\0\1\0\0\0" + zeros(200 * MB))
+    return png(16, 16, xmp, chunk(b"IDAT", zeros(49 * 16)))
 
 
 def tagged() -> bytes:
