@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -440,28 +440,10 @@ def read_property(file: SceneFile, name: str) -> Tensor:
     return torch.from_numpy(rows.astype(np.float64 if rows.dtype.kind != "f" else rows.dtype.newbyteorder("=")))
 
 
-#: Order of the properties in messages; f_rest_* follow.
-_ORDER = (*itertools.chain(*PROPERTIES.values()), "opacity")
 #: Log scale of the missing axis of flat Gaussians. In any scene, their thickness is far below rounding errors.
 FLAT = -40.0
 #: Rounding error of positions, relative to the median standard deviation of Gaussians, above which it is noted.
 MAX_ROUNDED = 0.1
-
-
-class _Flaws(NamedTuple):
-    """Invalid values in a block of rows.
-
-    Attributes:
-        start: First row of the block.
-        valid: Mask [n] bool of rows with valid values only.
-        counts: Numbers of NaN and of infinite values, for each property that has any.
-        unrotated: Rows with a quaternion of length 0, which is not a rotation.
-    """
-
-    start: int
-    valid: NDArray[np.bool_]
-    counts: dict[str, NDArray[np.int64]]
-    unrotated: NDArray[np.int64]
 
 
 def about_rounded_positions(means: NDArray[Any], scales: NDArray[Any]) -> tuple[str, ...]:
@@ -490,7 +472,7 @@ class SceneColumns:
 
     Attributes:
         arrays: float32 arrays by the names of the scene's tensors.
-        flaws: Invalid values of each block that contains any.
+        retained: Mask [count] bool of valid rows.
         clamped: Number of infinite opacities in each block that contains any. They are replaced by the logits of
             almost 0 and 1 that compressed formats use, because exporters write an alpha of 255 as infinity.
     """
@@ -516,8 +498,9 @@ class SceneColumns:
         self._filtered = FILTER_3D in names
         if is_flat(names) and "scale_2" not in self._sources:
             self._targets.pop("scale_2")[:] = FLAT
-        self.flaws: list[_Flaws] = []
+        self.retained = np.ones(count, np.bool_)
         self.clamped: list[int] = []
+        self._stored_flaws: list[NDArray[np.int64]] = []
 
     def take(self, start: int, rows: NDArray[Any]) -> None:
         """Copy a structured block of rows to the arrays from row `start` on. Thread-safe for different blocks."""
@@ -535,32 +518,23 @@ class SceneColumns:
 
         `rows` is required if SH coefficients stay in the file.
         """
-        opacities = self.arrays["opacities"][start : start + count]
+        block = slice(start, start + count)
+        opacities = self.arrays["opacities"][block]
         infinite = np.isinf(opacities)
         if infinite.any():
             self.clamped.append(int(infinite.sum()))
             np.clip(opacities, OPACITY_LOGITS[0], OPACITY_LOGITS[-1], out=opacities, where=infinite)
-        arrays = [array[start : start + count] for array in self.arrays.values()]
+        tables = [array[block].reshape(count, -1) for array in self.arrays.values()]
         if self._stored is not None and rows is not None:
-            table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
             first = self._stored.column // 4
-            arrays.append(table[:, first : first + 3 * self._stored.coefficients])
-        rotated = (self.arrays["quats"][start : start + count] != 0).any(axis=1)
-        if not (rotated.all() and all(bool(np.isfinite(array).all()) for array in arrays)):
-            self.flaws.append(self._flaws_of(start, count, rows))
-
-    def _flaws_of(self, start: int, count: int, rows: NDArray[Any] | None) -> _Flaws:
-        valid, counts = (self.arrays["quats"][start : start + count] != 0).any(axis=1), {}
-        unrotated = start + np.flatnonzero(~valid)
-        columns = {name: target[start : start + count] for name, target in self._targets.items()}
-        if self._stored is not None and rows is not None:
-            columns |= {name: rows[name] for name in map("f_rest_{}".format, range(3 * self._stored.coefficients))}
-        for name, column in columns.items():
-            nans, infinite = np.isnan(column), np.isinf(column)
-            valid &= ~(nans | infinite)
-            if nans.any() or infinite.any():
-                counts[name] = np.array([nans.sum(), infinite.sum()])
-        return _Flaws(start, valid, counts, unrotated)
+            table = rows.view(np.uint8).view("<f4").reshape(count, -1)
+            tables.append(table[:, first : first + 3 * self._stored.coefficients])
+        valid = (self.arrays["quats"][block] != 0).any(axis=1)
+        if valid.all() and all(bool(np.isfinite(table).all()) for table in tables):
+            return
+        self.retained[block] = valid & np.all([np.isfinite(table).all(axis=1) for table in tables], axis=0)
+        if self._stored is not None:
+            self._stored_flaws.append(np.stack([np.isnan(tables[-1]).sum(axis=0), np.isinf(tables[-1]).sum(axis=0)]))
 
     def valid_rows(self, path: Path, drop_invalid: bool, surplus: tuple[str, ...]) -> NDArray[np.bool_] | None:
         """Return the mask [count] bool of valid rows; None if all are valid.
@@ -572,27 +546,22 @@ class SceneColumns:
         Raises:
             SceneError: If invalid rows may not be dropped, or no valid rows remain.
         """
-        if not self.flaws:
+        retained = self.retained
+        if retained.all():
             return None
-        retained = np.ones(len(self.arrays["means"]), dtype=np.bool_)
-        totals: dict[str, NDArray[np.int64]] = {}
-        unrotated = np.concatenate([flaw.unrotated for flaw in self.flaws])
-        for flaw in self.flaws:
-            retained[flaw.start : flaw.start + len(flaw.valid)] = flaw.valid
-            for name, numbers in flaw.counts.items():
-                totals[name] = totals.get(name, 0) + numbers
-        rest = sorted(
-            (name for name in totals if name not in _ORDER), key=lambda name: int(name.removeprefix("f_rest_"))
-        )
+        counts = {name: (np.isnan(values).sum(), np.isinf(values).sum()) for name, values in self._targets.items()}
+        if self._stored_flaws:
+            counts |= {f"f_rest_{i}": numbers for i, numbers in enumerate(np.sum(self._stored_flaws, axis=0).T)}
         invalid = []
-        for name in [*(name for name in _ORDER if name in totals), *rest]:
-            counts = dict(zip(("NaN", "infinite"), totals[name], strict=True))
-            invalid.append(f"{name} ({', '.join(f'{number} {what}' for what, number in counts.items() if number)})")
+        for name, numbers in counts.items():
+            found = [f"{number} {what}" for number, what in zip(numbers, ("NaN", "infinite"), strict=True) if number]
+            invalid += [f"{name} ({', '.join(found)})"] if found else []
+        unrotated = np.flatnonzero((self.arrays["quats"] == 0).all(axis=1))
         bad = int((~retained).sum())
         flawed = [f"hold NaN or infinite values: {', '.join(invalid)}"] if invalid else []
         if len(unrotated):
             flawed += [
-                f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {min(unrotated)})"
+                f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {unrotated[0]})"
             ]
         summary = f"{path}: {bad} of {len(retained)} Gaussians {', or '.join(flawed)}"
         if surplus:
