@@ -340,8 +340,6 @@ def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:
 
     The 3x3 block is replaced by the nearest rotation; the camera's position does not change.
     """
-    if not np.isfinite(pose).all():
-        raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")
     rotation = exact_rotation(where, pose)[:3, :3]
     inverse = np.eye(4)
     inverse[:3, :3] = rotation.T
@@ -371,31 +369,23 @@ def _wrong(where: str, key: str, value: Any, expected: str, verb: str = "is") ->
 def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> NDArray[Any]:
     if key not in values:
         raise CameraError(f"{where}: has no {key!r}. Give {FORMATS}.")
-    nested = [values[key]]
-    while nested:  # NumPy would parse text as numbers, even `1_0`, and allocate the longest text for every entry
-        entry = nested.pop()
-        if isinstance(entry, list):
-            nested += entry
-        elif isinstance(entry, bool) or not isinstance(entry, (int, float)):
-            raise _wrong(where, key, entry, "only numbers", "is" if entry is values[key] else "holds")
-    try:
-        array = np.array(values[key], dtype=np.float64)
-    except (ValueError, OverflowError) as error:
-        raise CameraError(f"{where}: {key!r} is not an array of numbers. Export the cameras again.") from error
+    if not isinstance(values[key], list):
+        raise _wrong(where, key, values[key], "a list of numbers")
+    array = np.array(values[key], dtype=object)  # NumPy would parse text as numbers, even `1_0`
     if array.shape not in shapes:
         raise CameraError(f"{where}: {key!r} has shape {array.shape}, not {' or '.join(map(str, shapes))}.")
-    return array
+    return np.array([_number(where, {key: entry}, key, "holds") for entry in array.flat]).reshape(array.shape)
 
 
-def _number(where: str, values: Mapping[str, Any], key: str) -> float:
+def _number(where: str, values: Mapping[str, Any], key: str, verb: str = "is") -> float:
     if key not in values:
         raise CameraError(f"{where}: has no {key!r}. Give {FORMATS}.")
     value = values[key]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _wrong(where, key, value, "a number")
+        raise _wrong(where, key, value, "a number", verb)
     # no length or angle exceeds 1e100, and an integer in JSON may be too long for a float
     if not abs(value) < 1e100:
-        raise CameraError(f"{where}: {key!r} is {str(value)[:40]}, not a finite number. Export the cameras again.")
+        raise CameraError(f"{where}: {key!r} {verb} {str(value)[:40]}, not a finite number. Export the cameras again.")
     return float(value)
 
 
