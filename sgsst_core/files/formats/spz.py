@@ -72,8 +72,6 @@ _OLD_VERSIONS = tuple(struct.pack("<I", version) for version in (1, 2, 3))
 _DEFLATE_RATIO = 1032
 
 _READ_BYTES = 1 << 18
-#: Maximum bytes of a file's name, which gzip stores before the data.
-_NAME_BYTES = 1 << 20
 #: Maximum bytes of extensions.
 _EXTENSION_BYTES = 1 << 20
 #: Maximum window of zstd, the default limit of its command-line program: 2^27 bytes.
@@ -164,8 +162,6 @@ def _old_header(file_start: FileStart) -> SpzHeader:
     zipped = head.startswith(_GZIP_MAGIC)
     try:
         start = zlib.decompressobj(31).decompress(head, 16) if zipped else head[:16]
-        if len(start) < 16 and zipped:  # after a long file name
-            start = zlib.decompressobj(31).decompress(read_bytes(path, 0, _NAME_BYTES), 16)
     except zlib.error as error:
         raise SceneError(f"{path}: is a damaged gzip file: {error}. Copy or export it again.") from error
     if not start.startswith(_MAGIC) and not _MAGIC.startswith(start):
@@ -189,8 +185,8 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
     if number != len(expected) or table < 32 or table + 16 * number > size:
         declared = f"the SPZ header declares {number} streams with their table at byte {table}"
         raise truncated(path, f"{declared}; expected {len(expected)} streams in {size} bytes")
-    extensions = _Extensions.of(read_bytes(path, 32, min(table, 32 + _EXTENSION_BYTES)), header)
-    axes = extensions.axes(path)
+    records = read_bytes(path, 32, min(table, 32 + _EXTENSION_BYTES))
+    axes, notes, _ = _parsed_extensions(path, records, header)
     position = table + 16 * number
     streams, listed = [], list(struct.iter_unpack("<QQ", read_bytes(path, table, position)))
     for (compressed, decompressed), wanted in zip(listed, expected, strict=True):
@@ -200,10 +196,8 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
             raise truncated(path, f"{declared}; {needed}")
         streams.append((position, compressed))
         position += compressed
-    notes = (*extensions.notes(header.degree), *about_part(path, position, size))
-    return replace(
-        header, streams=tuple(streams), stated_axes=axes, notes=(*header.notes, *notes), tag=_tag(head[14], header)
-    )
+    notes = (*header.notes, *notes, *about_part(path, position, size))
+    return replace(header, streams=tuple(streams), stated_axes=axes, notes=notes, tag=_tag(head[14], header))
 
 
 def _tag(flags: int, header: SpzHeader) -> RenderTag:
@@ -219,50 +213,35 @@ def _tag(flags: int, header: SpzHeader) -> RenderTag:
     return RenderTag(warnings=(("classic", reason),))
 
 
-@dataclass(frozen=True)
-class _Extensions:
-    """Extension records of a file.
+def _parsed_extensions(path: Path, data: bytes, spz: SpzHeader) -> tuple[str | None, tuple[str, ...], int]:
+    """Parse extension records: type (uint32), length in bytes (uint32) and content.
 
-    Attributes:
-        records: Type and content of each complete record.
-        rest: Bytes in place of records, or after them; empty if there is only padding.
+    Returns:
+        Stated axes, None if there are none; notes on SH bands, extensions and bytes that are not read; and the number
+        of bytes in place of records, or after them.
     """
-
-    records: list[tuple[int, bytes]]
-    rest: bytes
-
-    @staticmethod
-    def of(data: bytes, spz: SpzHeader) -> _Extensions:
-        """Parse records: type (uint32), length in bytes (uint32) and content."""
-        records, position = [], 0
-        while spz.extended and position + 8 <= len(data):
-            kind, length = struct.unpack_from("<II", data, position)
-            if position + 8 + length > len(data):
-                break
-            position += 8 + length
-            records.append((kind, data[position - length : position]))
-        return _Extensions(records, without_padding(data[position:]))
-
-    def axes(self, path: Path) -> str | None:
-        """Return the stated axes; None if there are none."""
-        for kind, content in self.records:
-            if kind == _AXES_EXTENSION and len(content) >= 4:
-                number = int.from_bytes(content[:4], "little")
-                if number >= len(_AXES):
-                    raise SceneError(
-                        f"{path}: has the axes of SPZ's coordinate system {number}; 0 to {len(_AXES) - 1} can be read. "
-                        "Export it with one of these."
-                    )
-                return _AXES[number]
-        return None
-
-    def notes(self, degree: int) -> tuple[str, ...]:
-        """Return notes on SH bands, extensions and bytes that are not read."""
-        notes = ["SH bands above degree 3 are left out"] if degree > 3 else []
-        unknown = sorted({kind for kind, _ in self.records} - {_AXES_EXTENSION})[:_NOTED_EXTENSIONS]
-        if unknown:
-            notes.append(f"SPZ extensions {', '.join(f'{kind:#x}' for kind in unknown)} are unknown and left out")
-        return (*notes, *about_surplus(len(self.rest), "byte"))
+    axes, unknown, position = None, set[int](), 0
+    while spz.extended and position + 8 <= len(data):
+        kind, length = struct.unpack_from("<II", data, position)
+        if position + 8 + length > len(data):
+            break
+        position += 8 + length
+        if kind != _AXES_EXTENSION:
+            unknown.add(kind)
+        elif axes is None and length >= 4:
+            (number,) = struct.unpack_from("<I", data, position - length)
+            if number >= len(_AXES):
+                raise SceneError(
+                    f"{path}: has the axes of SPZ's coordinate system {number}; 0 to {len(_AXES) - 1} can be read. "
+                    "Export it with one of these."
+                )
+            axes = _AXES[number]
+    rest = len(without_padding(data[position:]))
+    notes = ["SH bands above degree 3 are left out"] if spz.degree > 3 else []
+    if unknown:
+        names = ", ".join(f"{kind:#x}" for kind in sorted(unknown)[:_NOTED_EXTENSIONS])
+        notes.append(f"SPZ extensions {names} are unknown and left out")
+    return axes, (*notes, *about_surplus(rest, "byte")), rest
 
 
 def _shared_fields(start: FileStart, head: bytes, versions: tuple[int, ...]) -> SpzHeader:
@@ -332,21 +311,20 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> SpzHeader:
         for block in blocks(spz.count):
             array[block] = decode(np.frombuffer(take((block.stop - block.start) * row_bytes), np.uint8))
     next(takes, None)  # reach the end of the last stream, where its checksum is verified
-    axes, notes = spz.stated_axes, list[str]()
+    axes, notes = spz.stated_axes, spz.notes
     if not spz.streams:
-        extensions, end = _extensions(path, stream, spz)
-        axes = extensions.axes(path) if spz.requested == "auto" else None
-        notes += [*extensions.notes(spz.degree), *about_part(path, end, spz.size)]
+        axes, more, end = _extensions(path, stream, spz)
+        notes += (*more, *about_part(path, end, spz.size))
     if spz.requested != "auto":
         axes = spz.requested
     elif axes is None:
-        notes.append(_ASSUMED_AXES)
+        notes += (_ASSUMED_AXES,)
     axes = axes or _AXES[0]
     if axes != "rdf":
         for name, array in into.items():
             for block in blocks(len(array)):
                 array[block] = _with_axes(name, array[block], _matrix(axes))
-    return replace(spz, axes=axes, notes=(*spz.notes, *notes))
+    return replace(spz, axes=axes, notes=notes)
 
 
 def _matrix(axes: str) -> NDArray[np.float64]:
@@ -417,17 +395,17 @@ class _Stream:
         return bytes(content)
 
 
-def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[_Extensions, int]:
-    """Return what follows the sections of version 1 to 3, and the byte offset of the end of the stream."""
+def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[str | None, tuple[str, ...], int]:
+    """Return the axes and notes on what follows the sections of version 1 to 3, and the offset of the stream's end."""
     content = _taken(path, stream.read, _EXTENSION_BYTES, least=0)
     if _taken(path, stream.read, 1, least=0):
         raise _too_much(path)
     if stream.inflate and not stream.inflate.eof:
         raise truncated(path, _ENDS_EARLY)
-    extensions = _Extensions.of(content, spz)
-    if len(extensions.rest) >= sum(spz.sections) // spz.count:
-        raise _too_much(path, f" by {number_of(len(extensions.rest), 'byte')}")
-    return extensions, stream.source.position - len(stream.inflate.unused_data if stream.inflate else b"")
+    axes, notes, rest = _parsed_extensions(path, content, spz)
+    if rest >= sum(spz.sections) // spz.count:
+        raise _too_much(path, f" by {number_of(rest, 'byte')}")
+    return axes, notes, stream.source.position - len(stream.inflate.unused_data if stream.inflate else b"")
 
 
 def _sections_of_streams(path: Path, file: OpenScene, spz: SpzHeader) -> Iterator[Take]:
