@@ -11,7 +11,6 @@ import itertools
 import os
 import re
 import tempfile
-import warnings
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -395,8 +394,7 @@ def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
                 f"{path}: cannot be read as PLY: there is a '_' among its numbers. Export the scene again."
             )
     try:
-        with _AsciiHeader(path, len(header.raw)) as stream, warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # for an empty list in text
+        with _AsciiHeader(path, len(header.raw)) as stream:
             vertices: NDArray[Any] = PlyData.read(stream)["vertex"].data
             return vertices
     except (PlyParseError, ValueError, OverflowError) as error:

@@ -21,10 +21,9 @@ Opacities have 8 bits. Rotations have three components of 10 bits each. SH coeff
 
 from __future__ import annotations
 
+import itertools
 import math
-import mmap
 import re
-import struct
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -120,7 +119,7 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
         Stored SH coefficients per channel, and `PlySceneHeader.sources`.
     """
     vertex = header.elements.get("vertex")
-    kinds = {name: kind for name, kind in vertex.kinds.items() if name not in vertex.lists} if vertex else {}
+    kinds = vertex.kinds if vertex else {}
     refuse_changed_meaning(path, kinds)
     sources = _sources(kinds)
     known = {*kinds, *sources, *(["scale_2"] if is_flat(kinds) else [])}
@@ -129,10 +128,6 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
         raise SceneError(f"{path}: is not a 3DGS scene but {_likely_content(header)}; missing: {', '.join(missing)}.")
     if vertex.count == 0:
         raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
-    for name in vertex.lists:
-        raise SceneError(
-            f"{path}: vertex property {name!r} is a list, which 3DGS scenes do not have. Export without it."
-        )
     for name in PROPERTIES["sh_dc"]:
         if name not in sources and kinds[name][0] != "f":
             raise SceneError(
@@ -198,8 +193,6 @@ PLY = SceneFormat("ply", "PLY", 248, _matches, _read_header, write=write_ply)
 #: Maximum size of a header. A 3DGS header takes 2 kB; a megabyte allows long comments. The limit avoids searching a
 #: whole file that is not a PLY for `end_header`.
 MAX_HEADER_BYTES = 1 << 20
-#: Maximum number of rows with lists, such as faces. Each is read to find its end, which takes a second for all.
-_MAX_LISTS = 1 << 21
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
@@ -251,7 +244,7 @@ class PlyElement:
         count_span: Start and end of the count in the bytes of the header.
         byte_order: Byte order of its numbers; "" in text files.
         kinds: NumPy type codes such as f4, by property; those of the items of a list.
-        lists: NumPy type codes of the lengths of lists, by property. Rows with lists differ in length.
+        lists: Properties that are lists, such as the vertices of a face. Only elements without rows may have any.
     """
 
     name: str
@@ -259,11 +252,11 @@ class PlyElement:
     count_span: tuple[int, int]
     byte_order: str
     kinds: dict[str, str] = field(default_factory=dict)
-    lists: dict[str, str] = field(default_factory=dict)
+    lists: list[str] = field(default_factory=list)
 
     @property
     def dtype(self) -> np.dtype:
-        """Return the dtype of a row in a binary file; only for elements without lists."""
+        """Return the dtype of a row in a binary file."""
         return np.dtype([(name, self.byte_order + kind) for name, kind in self.kinds.items()])
 
 
@@ -356,7 +349,7 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
                     )
                 last.kinds[name] = _TYPES[kind]
                 if lengths:
-                    last.lists[name] = _TYPES[lengths[1]]
+                    last.lists.append(name)
             case _:
                 shown = line[:80].decode("latin-1")
                 raise SceneError(f"{path}: line {number} of the PLY header is invalid: {shown!r}. Export it again.")
@@ -376,12 +369,17 @@ def check_length(path: Path, header: PlyHeader) -> None:
     """Check that a file is at least as long as its header declares, without allocating memory for the data.
 
     Raises:
-        SceneError: If the file is shorter than declared.
+        SceneError: If the file is shorter than declared, or its rows differ in length because they hold lists.
     """
     least = 0
-    for element in header.elements.values():  # text values have at least a digit and a separator; lists may be empty
-        sizes = [np.dtype(kind).itemsize for kind in {**element.kinds, **element.lists}.values()]
-        least += element.count * (2 * len(sizes) if header.text else sum(sizes))
+    for element in header.elements.values():
+        if element.lists and element.count:
+            raise SceneError(
+                f"{path}: element {element.name!r} holds lists ({', '.join(element.lists)[:80]}), which 3DGS scenes do "
+                "not have. Export the Gaussians without them."
+            )
+        # text values have at least a digit and a separator
+        least += element.count * (2 * len(element.kinds) if header.text else element.dtype.itemsize)
     data = path.stat().st_size - len(header.raw)
     if least - (1 if header.text else 0) > data:  # the last line may lack its line end
         declared = ", ".join(f"{element.count} {name}" for name, element in header.elements.items())
@@ -398,7 +396,9 @@ def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
         SceneError: If the file is shorter than declared.
     """
     check_length(path, header)
-    return {} if header.text else dict(zip(header.elements, _bounds(path, header), strict=False))
+    sizes = [element.count * element.dtype.itemsize for element in header.elements.values()]
+    offsets = itertools.accumulate(sizes, initial=len(header.raw))
+    return {} if header.text else dict(zip(header.elements, offsets, strict=False))
 
 
 def surplus(path: Path, header: PlyHeader) -> tuple[str, ...]:
@@ -413,54 +413,11 @@ def surplus(path: Path, header: PlyHeader) -> tuple[str, ...]:
             rows = sum(1 for line in lines if line.strip(" \t\r\n\x1a"))
         rows -= sum(element.count for element in header.elements.values())
         return about_surplus(max(0, rows), "row")
-    end, size = _bounds(path, header)[-1], path.stat().st_size
-    refuse_text_transfer(path, len(header.raw), header.newline, end, size)
     last = [*header.elements.values()][-1]
-    return about_part(path, end, size, None if last.lists else last.dtype.itemsize)
-
-
-def _bounds(path: Path, header: PlyHeader) -> list[int]:
-    """Return the byte offset of each element's rows in a binary file, and that of their end."""
-    size, position = path.stat().st_size, len(header.raw)
-    bounds = [position]
-    for element in header.elements.values():
-        if element.lists and element.count:
-            position = _end_of_lists(path, element, position)
-        elif element.count:
-            position += element.count * element.dtype.itemsize
-        if position > size:
-            raise truncated(path, f"ends within element {element.name!r}")
-        bounds.append(position)
-    return bounds
-
-
-def _end_of_lists(path: Path, element: PlyElement, position: int) -> int:
-    """Return the byte offset at which an element with lists ends.
-
-    The length of each list is read, and checked against the size of the file.
-    """
-    if element.count > _MAX_LISTS:
-        raise SceneError(
-            f"{path}: element {element.name!r} has {element.count:,} rows with lists, of at most {_MAX_LISTS:,}. "
-            "Export the Gaussians without it."
-        )
-    steps = [
-        (struct.Struct(element.byte_order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize)
-        for kind, length in ((kind, element.lists.get(name)) for name, kind in element.kinds.items())
-    ]
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        for _ in range(element.count):
-            for length, item_bytes in steps:
-                items = 1
-                if length is not None:
-                    if position + length.size > len(data):
-                        raise truncated(path, f"ends within element {element.name!r}")
-                    items = length.unpack_from(data, position)[0]
-                    if items < 0:
-                        raise SceneError(f"{path}: element {element.name!r} holds a list of length {items}: corrupt.")
-                    position += length.size
-                position += items * item_bytes
-        return position
+    row_bytes, size = last.dtype.itemsize, path.stat().st_size
+    end = element_offsets(path, header)[last.name] + last.count * row_bytes
+    refuse_text_transfer(path, len(header.raw), header.newline, end, size)
+    return about_part(path, end, size, row_bytes)
 
 
 def ply_tag(header: PlyHeader) -> RenderTag:
@@ -574,15 +531,14 @@ def _matches_compressed(start: FileStart) -> bool:
 def _read_compressed_header(start: FileStart) -> CompressedPlyHeader:
     path = start.path
     header = read_header(start)
-    vertex, chunk, harmonics = map(header.elements.get, ("vertex", "chunk", "sh"))
-    if vertex is None:
-        raise SceneError(f"{path}: is a compressed PLY without element 'vertex'. Export it again.")
+    for name in ("vertex", "chunk"):
+        if name not in header.elements:
+            raise SceneError(f"{path}: is a compressed PLY without element {name!r}. Export it again.")
+    vertex, chunk, harmonics = header.vertex, header.elements["chunk"], header.elements.get("sh")
     if header.text:
         raise SceneError(f"{path}: is a compressed PLY as text, which no program writes. Export it again as binary.")
     _check_kinds(path, vertex, "u4", _PACKED)
     refuse_changed_meaning(path, vertex.kinds)
-    if chunk is None:
-        raise SceneError(f"{path}: is a compressed PLY without element 'chunk', its bounds. Export it again.")
     _check_kinds(path, chunk, "f4", (*bounds("", "xyz"), *bounds("scale_", "xyz")))
     if "min_r" in chunk.kinds:
         _check_kinds(path, chunk, "f4", bounds("", "rgb"))
@@ -608,11 +564,11 @@ def _read_compressed_header(start: FileStart) -> CompressedPlyHeader:
 
 
 def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, ...]) -> None:
-    wrong = [name for name in names if element.kinds.get(name) != kind or name in element.lists]
-    if wrong or element.lists:
-        what = f"{', '.join(wrong)} missing or of another type" if wrong else "a list"
+    wrong = [name for name in names if element.kinds.get(name) != kind]
+    if wrong:
         raise SceneError(
-            f"{path}: is not a readable compressed PLY: element {element.name!r} has {what}. Export it again."
+            f"{path}: is not a readable compressed PLY: element {element.name!r} has {', '.join(wrong)} missing or of "
+            "another type. Export it again."
         )
 
 

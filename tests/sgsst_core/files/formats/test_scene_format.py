@@ -241,9 +241,9 @@ def as_text(data: bytes) -> bytes:
 
 
 def with_elements(data: bytes) -> bytes:
-    """Return a PLY with faces and another element after its Gaussians."""
-    lines = b"element face 2\nproperty list uchar int i\nelement view 1\nproperty double focal\nend_header\n"
-    return data.replace(b"end_header\n", lines) + 2 * struct.pack("<B3i", 3, 0, 1, 2) + struct.pack("<d", 1)
+    """Return a PLY with two other elements after its Gaussians."""
+    lines = b"element edge 2\nproperty int i\nelement view 1\nproperty double focal\nend_header\n"
+    return data.replace(b"end_header\n", lines) + struct.pack("<2id", 1, 2, 1)
 
 
 @pytest.mark.parametrize("change", [bytes, as_text, with_elements])
