@@ -130,7 +130,7 @@ def _inria_camera(where: str, entry: Mapping[str, Any]) -> Camera:
 def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -> list[Camera]:
     files = PhotoFolder(photos) if photos is not None and photos.is_dir() else None
     common = _stated(content)
-    frame_change = _dataparser_change(path, common)
+    change, scale = _training_frame(path, common)
 
     def convert(where: str, frame: dict[str, Any]) -> list[Camera]:
         name = str(PurePosixPath(_name(where, frame, "file_path").replace("\\", "/")))
@@ -138,9 +138,9 @@ def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -
         values = ChainMap(_stated(frame), common)  # a copy of the common values per frame could take hours
         size = _transforms_size(where, path.parent / name, values, files)
         pose = np.eye(4)
-        matrix = _array(where, values, "transform_matrix", (4, 4), (3, 4))
-        pose[:3] = matrix[:3]
-        pose = frame_change(pose)
+        pose[:3] = _array(where, values, "transform_matrix", (4, 4), (3, 4))[:3]
+        pose = change @ pose
+        pose[:3, 3] *= scale
         pose[:3, 1:3] *= -1  # from OpenGL's axes (x right, y up, z backward) to those of `Camera`
         model = _transforms_model(where, values)
         if model in _PANORAMAS:
@@ -219,15 +219,15 @@ def _transforms_intrinsics(
     return fx, fx if fy is None else fy, cx, cy
 
 
-def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
-    """Return the function from the file's poses [4, 4] to the poses that nerfstudio trained with.
+def _training_frame(path: Path, content: Mapping[str, Any]) -> tuple[NDArray[Any], float]:
+    """Return the matrix [4, 4] and the scale from the file's poses to those that nerfstudio trained with.
 
     nerfstudio stores T = T0 A and S = s0 a, where A and a (`applied_transform`, `applied_scale`) are already part of
     the file's poses. The training poses are s0 T0 pose.
     """
     dataparser = path.with_name("dataparser_transforms.json")
     if not dataparser.is_file():
-        return lambda pose: pose
+        return np.eye(4), 1.0
     values = load_json(dataparser)
     if not isinstance(values, dict):
         raise CameraError(f"{dataparser}: needs a JSON object with `transform` and `scale`. Copy it again.")
@@ -239,14 +239,7 @@ def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
     if "applied_scale" in content:
         scale /= _positive(str(path), "applied_scale", _number(str(path), content, "applied_scale"))
     change = stored @ np.linalg.inv(exact_rotation(f"{path}: applied_transform", applied))
-    _positive(str(dataparser), "scale", scale)
-
-    def apply(pose: NDArray[Any]) -> NDArray[Any]:
-        changed = change @ pose
-        changed[:3, 3] *= scale
-        return np.asarray(changed)
-
-    return apply
+    return change, _positive(str(dataparser), "scale", scale)
 
 
 def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:

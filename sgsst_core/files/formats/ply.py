@@ -539,9 +539,7 @@ def _read_compressed_header(start: FileStart) -> CompressedPlyHeader:
         raise SceneError(f"{path}: is a compressed PLY as text, which no program writes. Export it again as binary.")
     _check_kinds(path, vertex, "u4", _PACKED)
     refuse_changed_meaning(path, vertex.kinds)
-    _check_kinds(path, chunk, "f4", (*bounds("", "xyz"), *bounds("scale_", "xyz")))
-    if "min_r" in chunk.kinds:
-        _check_kinds(path, chunk, "f4", bounds("", "rgb"))
+    _check_kinds(path, chunk, "f4", _BOUNDS if "min_r" in chunk.kinds else _BOUNDS[:12])
     if not vertex.count:
         raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
     expected = -(-vertex.count // CHUNK_ROWS)
