@@ -20,7 +20,6 @@ from __future__ import annotations
 import json
 import re
 import struct
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,16 +112,12 @@ class Accessor:
         stride: Bytes from one value to the next.
         kind: dtype of a value with its components.
         largest: Integer that stands for 1 if integers are normalized; None otherwise.
-        view: Index of the buffer view.
-        view_end: Byte offset of the end of the buffer view.
     """
 
     offset: int
     stride: int
     kind: np.dtype
     largest: int | None
-    view: int
-    view_end: int
 
 
 @dataclass(frozen=True)
@@ -182,7 +177,7 @@ def _read_header(start: FileStart) -> GlbHeader:
         linear = "colors are linear, and converted to sRGB for each Gaussian; where Gaussians overlap, renders differ"
         notes += [linear] if any(part.linear for part in parts) else []
         notes += [note for part in parts if part.spz for note in part.spz[1].notes]
-        notes += _about_rest(path, document, parts, data)
+        notes += _about_rest(path, document, data)
     except _WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
     count = sum(part.count for part in parts)
@@ -297,25 +292,13 @@ def _part(
     )
 
 
-def _about_rest(path: Path, document: dict[str, Any], parts: list[GlbPart], data: range) -> list[str]:
-    """Return notes on bytes after the binary data, and on rows of buffer views that only Gaussians are read from."""
+def _about_rest(path: Path, document: dict[str, Any], data: range) -> list[str]:
+    """Return notes on bytes after the declared data, in its chunk and after it."""
     declared = document["buffers"][0].get("byteLength", len(data))
     if type(declared) is not int or declared < 0:
         raise ValueError(f"byteLength: {declared}")
     spans = [(data.start + declared, data.stop), (data.stop, path.stat().st_size)]
-    ends = {
-        accessor: accessor.offset + (part.count - 1) * accessor.stride + accessor.kind.itemsize
-        for part in parts
-        for accessor in (*part.accessors.values(), *part.harmonics)
-    }
-    readers = Counter(entry.get("bufferView") for entry in document["accessors"])
-    views = {accessor.view: accessor for accessor in reversed(ends)}
-    for view, first in views.items():
-        read = [end for accessor, end in ends.items() if accessor.view == view]
-        if len(read) == readers[view] and first.view_end - max(read) >= first.stride:
-            spans.append((max(read), first.view_end))
-            break  # other attributes have as many rows
-    return [note for span in dict.fromkeys(spans) for note in about_part(path, *span)]
+    return [note for span in spans for note in about_part(path, *span)]
 
 
 def _accessor(document: dict[str, Any], index: int, shape: str, count: int, data: range) -> Accessor:
@@ -333,7 +316,7 @@ def _accessor(document: dict[str, Any], index: int, shape: str, count: int, data
     if first + (count - 1) * stride + kind.itemsize > size or not kind.itemsize <= stride <= _MAX_STRIDE:
         raise ValueError(f"accessor {index}: {count} values are more than its {size} bytes can hold")
     largest = _LARGEST.get(code) if entry.get("normalized", False) else None
-    return Accessor(start + first, stride, kind, largest, entry["bufferView"], start + size)
+    return Accessor(start + first, stride, kind, largest)
 
 
 def _view(document: dict[str, Any], index: int, data: range) -> tuple[int, int]:

@@ -314,7 +314,6 @@ def longer_glb(data: bytes) -> bytes:
             for name in ("compressed.ply", "spz", "v3.spz", "sog", "glb")
         ),
         ("sog", lambda data: b"PK\3\4" + bytes(6) + data, "10 bytes"),
-        ("glb", lambda data: data.replace(b'"count": 616', b'"count": 600'), f"{16 * 12} bytes"),
         ("glb", longer_glb, "40 bytes"),
         ("v3.spz", lambda data: gzip.compress(gzip.decompress(data) + b"12345"), "5 bytes"),
     ],
