@@ -9,7 +9,6 @@ import importlib.util
 import io
 import itertools
 import os
-import re
 import tempfile
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -217,18 +216,14 @@ def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
     """
     if not isinstance(declared, PlySceneHeader) or not declared.coefficients or declared.sources:
         return False
-    header = declared.ply
-    names = [*header.vertex.kinds]
-    if header.byte_order != "<" or "f_rest_0" not in names:
-        return False
-    limit = HELD_BYTES if held_bytes is None else held_bytes
-    dtype = header.vertex.dtype
-    count = sum(name.startswith("f_rest_") for name in names)
-    first = names.index("f_rest_0")
-    plain = names[first : first + count] == [f"f_rest_{i}" for i in range(count)]
-    plain &= all(dtype[name] == np.dtype("<f4") for name in names[first : first + count])
+    vertex = declared.ply.vertex
+    rest = [(f"f_rest_{i}", "f4") for i in range(3 * declared.stored_coefficients)]
+    first = [*vertex.kinds].index("f_rest_0")
+    plain = declared.ply.byte_order == "<" and [*vertex.kinds.items()][first : first + len(rest)] == rest
+    dtype = vertex.dtype
     offset = dtype.fields["f_rest_0"][1] if dtype.fields else 0
-    return plain and dtype.itemsize % 4 == 0 and offset % 4 == 0 and 4 * count * header.vertex.count > limit
+    limit = HELD_BYTES if held_bytes is None else held_bytes
+    return plain and dtype.itemsize % 4 == 0 and offset % 4 == 0 and 4 * len(rest) * vertex.count > limit
 
 
 def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY, axes: str = "rub") -> None:
@@ -370,21 +365,6 @@ def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: SceneColum
             done.result()
 
 
-class _AsciiHeader(io.BufferedReader):
-    """File that replaces non-ASCII characters in a PLY header, which plyfile does not accept.
-
-    Such characters may occur in comments.
-    """
-
-    def __init__(self, path: Path, header_bytes: int) -> None:
-        super().__init__(io.FileIO(path))
-        self._header_bytes = header_bytes
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        data = super().read(size)
-        return re.sub(rb"[\x80-\xff]", b"?", data) if self.tell() <= self._header_bytes else data
-
-
 def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
     """Read the vertex element of a text file as a structured array [rows]."""
     with path.open("rb") as file:
@@ -394,7 +374,8 @@ def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
                 f"{path}: cannot be read as PLY: there is a '_' among its numbers. Export the scene again."
             )
     try:
-        with _AsciiHeader(path, len(header.raw)) as stream:
+        # plyfile accepts ASCII alone, but comments may hold any characters
+        with path.open(encoding="ascii", errors="backslashreplace", newline="") as stream:
             vertices: NDArray[Any] = PlyData.read(stream)["vertex"].data
             return vertices
     except (PlyParseError, ValueError, OverflowError) as error:

@@ -12,6 +12,7 @@ import io
 import itertools
 import math
 import re
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -184,7 +185,7 @@ def _write_binary(
     dtype = header.vertex.dtype
     before = element_offsets(source.path, header)["vertex"] - len(header.raw)
     file.seek(len(header.raw))
-    _copy(file, output, before)
+    output.write(file.read(before))
     buffer = bytearray(min(BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
     for count, times, gaussians in _blocks(source, header.vertex.count):
         part = memoryview(buffer)[: count * dtype.itemsize]
@@ -200,19 +201,9 @@ def _write_binary(
         for name in changes.attenuated:
             rows[name] = changes.times(rows[name].astype(np.float32))
         output.write(rows.view(np.uint8).data)
-    _copy(file, output)
+    shutil.copyfileobj(file, output)
     if file_stamp(source.path) != source.stamp:
         raise changed(source.path)
-
-
-def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:
-    """Copy `count` bytes, or all remaining bytes if it is None."""
-    while count is None or count > 0:
-        data = file.read(1 << 20 if count is None else min(count, 1 << 20))
-        if not data:
-            return
-        output.write(data)
-        count = None if count is None else count - len(data)
 
 
 def _write_text(
@@ -276,8 +267,6 @@ def write_colors(path: Path, sh_dc: Tensor) -> None:
 
 #: Largest absolute weight after normalization. Larger ones amplify the rounding errors of the files.
 MAX_WEIGHT = 10.0
-#: Gaussians per block of float64 sums.
-_BLOCK_ROWS = 1 << 18
 #: Fields in which all scenes must be equal, and what they are called in messages.
 _SHAPE = {"means": "positions", "quats": "rotations", "scales": "scales", "opacities": "opacities"}
 
@@ -376,8 +365,7 @@ def _weighted_sum(tensors: Sequence[Tensor], weights: Sequence[float]) -> Tensor
     """Return the weighted sum of float32 tensors of one shape, computed in float64."""
     result = torch.empty_like(tensors[0])
     largest = torch.finfo(result.dtype).max
-    for start in range(0, len(result), _BLOCK_ROWS):
-        rows = slice(start, start + _BLOCK_ROWS)
+    for rows in blocks(len(result)):
         total = torch.zeros(result[rows].shape, dtype=torch.float64)
         for tensor, weight in zip(tensors, weights, strict=True):
             total += weight * tensor[rows].double()

@@ -52,11 +52,11 @@ from sgsst_core.files.formats.scene_format import (
     along_curve,
     blocks,
     opacity_bytes,
+    pack_bits,
     read_bytes,
     read_rows,
     refuse_text_transfer,
     stated,
-    to_steps,
     truncated,
     usable_eps2d,
     with_largest,
@@ -509,6 +509,8 @@ def bounds(prefix: str, axes: str) -> tuple[str, ...]:
     return tuple(f"{side}_{prefix}{axis}" for side in ("min", "max") for axis in axes)
 
 
+#: Bits of three components of a position or a scale.
+_THREE_BITS = (11, 10, 11)
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = (*bounds("", "xyz"), *bounds("scale_", "xyz"), *bounds("", "rgb"))
 #: Maximum absolute log scale; other writers of the format clamp to it too.
@@ -669,31 +671,14 @@ def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         bounds_of += [low, high]
         extent = high.astype(np.float64) - low
         fractions.append((values.astype(np.float64) - low[chunk]) / np.where(extent > 0, extent, 1)[chunk])
-    color = [to_steps(fractions[2][:, i], 255) for i in range(3)]
-    packed = np.stack(
-        [
-            _pack_three(fractions[0]),
-            _pack_rotations(arrays["quats"]),
-            _pack_three(fractions[1]),
-            color[0] << 24 | color[1] << 16 | color[2] << 8 | opacity_bytes(arrays["opacities"]).astype(np.uint32),
-        ],
-        axis=1,
-    )
-    return np.concatenate(bounds_of, axis=1), packed
-
-
-def _pack_three(fractions: NDArray[np.float64]) -> NDArray[Any]:
-    x, y, z = (to_steps(fractions[:, i], maximum) for i, maximum in enumerate((2047, 1023, 2047)))
-    packed: NDArray[np.uint32] = x << np.uint32(21) | y << np.uint32(11) | z
-    return packed
-
-
-def _pack_rotations(quats: NDArray[np.float32]) -> NDArray[Any]:
-    largest, three = without_largest(quats)
-    a, b, c = (to_steps(three[:, i] / np.sqrt(2) + 0.5, 1023) for i in range(3))
-    packed: NDArray[np.uint32] = largest.astype(np.uint32) << np.uint32(30)
-    packed |= a << np.uint32(20) | b << np.uint32(10) | c
-    return packed
+    largest, three = without_largest(arrays["quats"])
+    packed = [
+        pack_bits(fractions[0], _THREE_BITS),
+        pack_bits(np.column_stack([largest / 3, three / np.sqrt(2) + 0.5]), (2, 10, 10, 10)),
+        pack_bits(fractions[1], _THREE_BITS),
+        pack_bits(np.column_stack([fractions[2], opacity_bytes(arrays["opacities"]) / 255]), (8, 8, 8, 8)),
+    ]
+    return np.concatenate(bounds_of, axis=1), np.stack(packed, axis=1)
 
 
 def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:

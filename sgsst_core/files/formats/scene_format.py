@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import codecs
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -459,6 +459,14 @@ def to_steps(values: NDArray[Any], maximum: int) -> NDArray[np.uint32]:
     """Quantize values to uint32 steps 0..maximum, which cover the range 0..1. Values outside it are clamped."""
     steps: NDArray[np.uint32] = np.rint(np.clip(values, 0, 1) * maximum).astype(np.uint32)
     return steps
+
+
+def pack_bits(fractions: NDArray[np.float64], widths: Sequence[int]) -> NDArray[np.uint32]:
+    """Quantize fractions [n, k] in 0..1 to k numbers of some bits, and pack each row, the first in the highest bits."""
+    packed: NDArray[np.uint32] = np.zeros(len(fractions), np.uint32)
+    for column, width in zip(fractions.T, widths, strict=True):
+        packed = packed << np.uint32(width) | to_steps(column, (1 << width) - 1)
+    return packed
 
 
 def with_largest(index: NDArray[Any], three: NDArray[np.float64]) -> NDArray[np.float64]:

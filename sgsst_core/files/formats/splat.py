@@ -85,6 +85,8 @@ _MAX_DEGREE = 2
 _TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}
 #: Default of the largest position step and of the range of SH coefficients at level 2.
 _STEPS, _RANGE = 32767, 1.5
+#: Positions of SH coefficients among those of a Gaussian, [8, 3]: one band after the other, channel-major in each.
+_ORDER = np.concatenate([np.arange(9).reshape(3, 3).T, 9 + np.arange(15).reshape(3, 5).T])
 #: Log scale of those that 16-bit floats round to 0: half of the smallest positive one.
 _MIN_LOG_SCALE = math.log(2.0**-25)
 
@@ -232,16 +234,11 @@ def _buckets(file: OpenScene, section: KsplatSection) -> tuple[NDArray[np.int64]
 
 def _harmonics(values: NDArray[np.generic], header: KsplatHeader, section: KsplatSection) -> NDArray[np.float64]:
     """Return SH coefficients [n, coefficients, 3]."""
-    numbers = values.astype(np.float64)
-    if header.level == 2:
-        low, high = header.harmonics
-        numbers = low + (high - low) * (numbers / 255)
-    bands, first = [np.zeros((len(numbers), 0, 3))], 0
-    for degree in range(1, section.degree + 1):
-        width = 2 * degree + 1
-        bands.append(numbers[:, first : first + 3 * width].reshape(-1, 3, width).transpose(0, 2, 1))
-        first += 3 * width
-    return np.concatenate(bands, axis=1)
+    numbers = values.astype(np.float64)[:, _ORDER[: COEFFICIENTS[section.degree]]]
+    if header.level != 2:
+        return numbers
+    low, high = header.harmonics
+    return low + (high - low) * (numbers / 255)
 
 
 KSPLAT = SceneFormat("ksplat", ".ksplat", 44, _matches_ksplat, _read_ksplat_header, _read_ksplat)

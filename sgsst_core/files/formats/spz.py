@@ -51,6 +51,7 @@ from sgsst_core.files.formats.scene_format import (
     harmonics_matrix,
     number_of,
     opacity_bytes,
+    pack_bits,
     read_bytes,
     read_rows,
     stated,
@@ -541,11 +542,8 @@ def _encode_positions(means: NDArray[np.float64], bits: int) -> NDArray[Any]:
 
 def _encode_rotations(quats: NDArray[np.float64]) -> NDArray[Any]:
     largest, three = without_largest(np.roll(quats, -1, axis=1))
-    components = np.rint(np.minimum(np.abs(three) / np.sqrt(0.5), 1) * 511).astype(np.uint32)
-    components |= np.where(three < 0, 512, 0).astype(np.uint32)
-    packed: NDArray[np.uint32] = largest.astype(np.uint32) << np.uint32(30)
-    packed |= components[:, 0] << 20 | components[:, 1] << 10 | components[:, 2]
-    return packed.astype("<u4")
+    components = np.stack([three < 0, np.abs(three) / np.sqrt(0.5)], axis=2).reshape(-1, 6)
+    return pack_bits(np.column_stack([largest / 3, components]), (2, 1, 9, 1, 9, 1, 9)).astype("<u4")
 
 
 def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sgsst_core.errors import SceneError, SettingsError
-from sgsst_core.files import stylized_ply as blending
+from sgsst_core.files.formats import scene_format
 from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from sgsst_core.files.stylized_ply import blend_scenes, normalized
@@ -34,7 +34,7 @@ def written(folder: Path, *scenes: Scene) -> list[SceneFile]:
 def test_blend_is_the_weighted_mean(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: tuple[float, ...]
 ) -> None:
-    monkeypatch.setattr(blending, "_BLOCK_ROWS", 17)
+    monkeypatch.setattr(scene_format, "BLOCK_ROWS", 17)
     scene = cloud(60, degree=2)
     files = written(tmp_path, *[recolored(scene, seed) for seed in range(len(weights))])
     blend = blend_scenes(files, weights)
