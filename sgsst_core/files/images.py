@@ -194,11 +194,12 @@ def _opened(path: Path, *, pixels: bool = True) -> Iterator[Image.Image]:
     """
     try:
         with path.open("rb") as file:
-            is_png = file.read(len(_PNG_SIGNATURE)) == _PNG_SIGNATURE
+            head = file.read(12)
+        is_png = head.startswith(_PNG_SIGNATURE)
         source, colors = _open_png(path, pixels=pixels) if is_png else (path, {})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
-            opened = Image.open(source, formats=[*FORMATS, *_heif_format(path)])
+            opened = Image.open(source, formats=[*FORMATS, *_heif_format(path, head)])
         with opened as image:
             if is_png and (b"cICP" in colors or not image.info.get("icc_profile")):
                 image.info["icc_profile"] = colors
@@ -236,13 +237,11 @@ def _check_scans(path: Path) -> None:
             raise ImageError(f"{path}: is a progressive JPEG of more than {MAX_JPEG_SCANS} scans. Save it as PNG.")
 
 
-def _heif_format(path: Path) -> tuple[str, ...]:
+def _heif_format(path: Path, head: bytes) -> tuple[str, ...]:
     """Return the name of Pillow's format for a HEIC file, and nothing for other files.
 
     HEIC begins with a file type box of ISO/IEC 14496-12; its brands are those of ISO/IEC 23008-12.
     """
-    with path.open("rb") as file:
-        head = file.read(12)
     if head[4:8] != b"ftyp" or head[8:12] not in _HEIF_BRANDS:
         return ()
     try:

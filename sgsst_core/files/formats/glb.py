@@ -33,6 +33,7 @@ from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import refuse_changed_meaning
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
+    WRONG_JSON,
     Y_UP,
     Arrays,
     FileStart,
@@ -99,8 +100,6 @@ _HARMONICS = [f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for degree in (1, 2, 3
 #: Range of written log scales, within that of float32, and largest written opacity, the last one below 1.
 _LOG_SCALES = (-87.0, 88.0)
 _LARGEST_OPACITY = 1 - 2.0**-24
-#: Errors of a JSON document with missing or wrong values.
-_WRONG_JSON = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, OverflowError)
 
 
 @dataclass(frozen=True)
@@ -178,7 +177,7 @@ def _read_header(start: FileStart) -> GlbHeader:
         notes += [linear] if any(part.linear for part in parts) else []
         notes += [note for part in parts if part.spz for note in part.spz[1].notes]
         notes += _about_rest(path, document, data)
-    except _WRONG_JSON as error:
+    except WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
     count = sum(part.count for part in parts)
     if count > len(data):
@@ -245,7 +244,7 @@ def _shown_splats(path: Path, document: dict[str, Any]) -> tuple[list[tuple[dict
 def _part(
     path: Path, document: dict[str, Any], primitive: dict[str, Any], matrix: NDArray[np.float64], data: range
 ) -> GlbPart:
-    """Parse a primitive of Gaussians. Errors of `_WRONG_JSON` mean that a value is missing or wrong."""
+    """Parse a primitive of Gaussians. Errors of `WRONG_JSON` mean that a value is missing or wrong."""
     declared = primitive["extensions"][_EXTENSION]
     linear = declared.get("colorSpace") == _LINEAR
     for name, supported in _SUPPORTED.items():

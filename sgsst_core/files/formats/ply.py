@@ -24,7 +24,6 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -326,7 +325,8 @@ def read_header(file: FileStart) -> PlyHeader:
 
 def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
     byte_order: str | None = None
-    elements: list[PlyElement] = []
+    elements: dict[str, PlyElement] = {}
+    last: PlyElement | None = None
     position = 0
     for number, line in enumerate(raw.split(newline), start=1):
         words = [word.decode("latin-1") for word in line.split()]
@@ -340,13 +340,13 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
             # 18 digits are more than any file needs, and stay below the limit of int() on long strings
             case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count) and byte_order is not None:
                 stop = position + len(line.rstrip())
-                elements.append(PlyElement(name, int(count), (stop - len(count), stop), byte_order))
-            case ["property", *lengths, kind, name] if elements and kind in _TYPES and lengths in _LENGTHS:
-                last = elements[-1]
+                last = PlyElement(name, int(count), (stop - len(count), stop), byte_order)
+                if name in elements:
+                    raise SceneError(f"{path}: the PLY header declares element {name!r} twice. Export it again.")
+                elements[name] = last
+            case ["property", *lengths, kind, name] if last and kind in _TYPES and lengths in _LENGTHS:
                 if name in last.kinds:
-                    raise SceneError(
-                        f"{path}: the PLY header declares {last.name}.{name} twice. Export the scene again."
-                    )
+                    raise SceneError(f"{path}: the PLY header declares {last.name}.{name} twice. Export it again.")
                 last.kinds[name] = _TYPES[kind]
                 if lengths:
                     last.lists.append(name)
@@ -356,13 +356,10 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
         position += len(line) + len(newline)
     if byte_order is None:
         raise SceneError(f"{path}: the PLY header has no 'format' line. Export the scene again.")
-    uses = Counter(each.name for each in elements)
-    for each in elements:
-        if uses[each.name] > 1:
-            raise SceneError(f"{path}: the PLY header declares element {each.name!r} twice. Export the scene again.")
+    for each in elements.values():
         if each.count and not each.kinds:
             raise SceneError(f"{path}: element {each.name!r} of the PLY header has no property. Export it again.")
-    return PlyHeader(byte_order, raw, {each.name: each for each in elements})
+    return PlyHeader(byte_order, raw, elements)
 
 
 def check_length(path: Path, header: PlyHeader) -> None:

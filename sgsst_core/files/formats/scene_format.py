@@ -210,6 +210,10 @@ def usable_eps2d(value: Any) -> float | None:
     return number if math.isfinite(number) and 0 < number <= MAX_EPS2D else None
 
 
+#: Errors of a JSON document with missing or wrong values.
+WRONG_JSON = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, OverflowError)
+
+
 def json_numbers(values: Any, count: int) -> NDArray[np.float64]:
     """Return `count` numbers of a parsed JSON list, or a single number, as float64. null becomes NaN.
 

@@ -44,6 +44,7 @@ from sgsst_core.files.advice import SCENES, converted, known_kind, refuse_change
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
     OPACITY_LOGITS,
+    WRONG_JSON,
     Arrays,
     FileStart,
     Limits,
@@ -289,8 +290,6 @@ _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _IMAGES = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
 #: File names: without folders, so that no other files are read.
 _NAME = re.compile(r"[\w-][\w.-]{0,99}")
-#: Errors of a JSON document with missing or wrong values.
-WRONG_JSON = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, OverflowError)
 
 #: Effort of lossless compression, 0 to 100.
 _EFFORT = 50
@@ -547,22 +546,21 @@ def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> None:
     """Fill the arrays of a scene."""
     where = f"{files.path}: {files.folder}"
     read_positions(files, header, into["means"])
-    quats = _pixels(files, header, "quats")[: header.count]
+    quats = _pixels(files, header, "quats")
     for block in blocks(header.count):
         index = quats[block, 3].astype(np.int64) - _FIRST_TAG
         if index.min() < 0:
             raise SceneError(f"{where}{header.names['quats'][0]} has no valid rotations. Export the scene again.")
         into["quats"][block] = with_largest(index, (quats[block, :3] / 255 - 0.5) * np.sqrt(2))
-    scales, colors = (_pixels(files, header, name)[: header.count] for name in ("scales", "sh0"))
+    colors = _pixels(files, header, "sh0")
+    into["scales"][:] = _looked_up(header.scales, _pixels(files, header, "scales"))
+    into["sh_dc"][:] = _looked_up(header.colors, colors)
     with np.errstate(over="ignore", invalid="ignore"):
-        for axis in range(3):
-            into["scales"][:, axis] = header.scales[axis].astype(np.float32)[scales[:, axis]]
-        into["sh_dc"][:] = _colors(header, colors)
         into["opacities"][:] = header.opacities.astype(np.float32)[colors[:, 3]]
         if header.harmonics is not None:
             stored = files.pixels(header.names["shN"][0], 1, _PALETTE_PIXELS)[..., :3]
             entries = header.harmonics.astype(np.float32)[stored.reshape(-1, header.coefficients, 3)]
-            labels = _pixels(files, header, "shN", 1)[: header.count, :2].astype(np.int64) @ np.array([1, 256])
+            labels = _pixels(files, header, "shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
             vectors = min(len(entries), header.vectors or len(entries))
             if labels.max() >= vectors:
                 raise SceneError(
@@ -573,13 +571,13 @@ def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> None:
 
 
 def _pixels(files: SogFiles, header: SogHeader, name: str, index: int = 0) -> NDArray[np.uint8]:
-    """Return the pixels of an image of a property, [at least the number of Gaussians, 4] uint8."""
-    return files.pixels(header.names[name][index], header.count).reshape(-1, 4)
+    """Return the pixels of an image of a property, [number of Gaussians, 4] uint8."""
+    return files.pixels(header.names[name][index], header.count).reshape(-1, 4)[: header.count]
 
 
 def read_positions(files: SogFiles, header: SogHeader, into: NDArray[np.float32]) -> None:
     """Fill an array [n, 3] with the positions of a scene."""
-    low, high = (_pixels(files, header, "means", index)[: header.count] for index in (0, 1))
+    low, high = (_pixels(files, header, "means", index) for index in (0, 1))
     for block in blocks(header.count):
         steps = (low[block, :3] | high[block, :3].astype(np.uint16) << 8) / 65535
         values = header.bounds[0] + (header.bounds[1] - header.bounds[0]) * steps
@@ -587,15 +585,10 @@ def read_positions(files: SogFiles, header: SogHeader, into: NDArray[np.float32]
             into[block] = np.sign(values) * np.expm1(np.abs(values))
 
 
-def read_colors(files: SogFiles, header: SogHeader, into: NDArray[np.float32]) -> None:
-    """Fill an array [n, 3] with the SH coefficients of degree 0 of a scene."""
-    into[:] = _colors(header, _pixels(files, header, "sh0")[: header.count])
-
-
-def _colors(header: SogHeader, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the SH coefficients of degree 0 of pixels [n, 4] of their image, [n, 3]."""
+def _looked_up(tables: NDArray[np.float64], pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the values of pixels [n, 4] in a table for each of three channels, [n, 3]."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.stack([header.colors[axis].astype(np.float32)[pixels[:, axis]] for axis in range(3)], axis=1)
+        return np.stack([tables[axis].astype(np.float32)[pixels[:, axis]] for axis in range(3)], axis=1)
 
 
 def recolored(files: SogFiles, header: SogHeader, change: NDArray[np.float32]) -> dict[str, bytes]:
@@ -619,7 +612,7 @@ def recolored(files: SogFiles, header: SogHeader, change: NDArray[np.float32]) -
         raise OutputError(f"{files.folder} of it is SOG of version 1. Write it again with splat-transform.")
     image = files.pixels(name, header.count)
     pixels = image.reshape(-1, 4).copy()
-    colors = _colors(header, pixels[: header.count]) + change
+    colors = _looked_up(header.colors, pixels[: header.count]) + change
     codebook = value_codebook(colors)
     pixels[: header.count, :3] = nearest_entries(colors, codebook)
     meta["sh0"]["codebook"] = codebook.tolist()
@@ -906,7 +899,8 @@ def write_recolored(
         own: Arrays = {name: np.empty((header.count, 3), np.float32) for name in ("means", "sh_dc")}
         for part, rows in header.rows:
             read_positions(files.part(part.folder), part.header, own["means"][rows])
-            read_colors(files.part(part.folder), part.header, own["sh_dc"][rows])
+            pixels = _pixels(files.part(part.folder), part.header, "sh0")
+            own["sh_dc"][rows] = _looked_up(part.header.colors, pixels)
         if not np.array_equal(means, own["means"]):
             raise OutputError(
                 f"the scene's Gaussians are not those of the finest level of {original}, in the same order. Give that "
