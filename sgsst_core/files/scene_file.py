@@ -202,10 +202,8 @@ def read_scene(
         scene = scene.subset(torch.from_numpy(retained))
     if isinstance(header, PlySceneHeader) and header.sources:
         ply = None
-    clamped = sum(columns.clamped)
-    return SceneFile(
-        path, scene, ply, retained, stamp, header.format.name, clamped, notes, header.tag, axes=header.axes
-    )
+    fields = (header.format.name, sum(columns.clamped), notes, header.tag)
+    return SceneFile(path, scene, ply, retained, stamp, *fields, axes=header.axes)
 
 
 def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:

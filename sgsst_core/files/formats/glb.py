@@ -129,7 +129,7 @@ class GlbPart:
         frame: Transformation to the axes of a PLY.
         tag: Render mode that the set states.
         linear: Whether colors are linear.
-        spz: Byte offset and header of the SPZ that holds all attributes, in place of accessors; None if none does.
+        spz: Header of the SPZ that holds all attributes, in place of accessors; None if none does.
     """
 
     count: int
@@ -138,12 +138,12 @@ class GlbPart:
     frame: Frame
     tag: RenderTag
     linear: bool
-    spz: tuple[int, SceneHeader] | None = None
+    spz: SceneHeader | None = None
 
     @property
     def coefficients(self) -> int:
         """Return the number of SH coefficients per color channel above degree 0."""
-        return self.spz[1].coefficients if self.spz else len(self.harmonics)
+        return self.spz.coefficients if self.spz else len(self.harmonics)
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def _read_header(start: FileStart) -> GlbHeader:
         notes += [f"{', '.join(sorted(unknown))[:80]} of {_EXTENSION} are unknown and ignored"] if unknown else []
         linear = "colors are linear, and converted to sRGB for each Gaussian; where Gaussians overlap, renders differ"
         notes += [linear] if any(part.linear for part in parts) else []
-        notes += [note for part in parts if part.spz for note in part.spz[1].notes]
+        notes += [note for part in parts if part.spz for note in part.spz.notes]
         notes += _about_rest(path, document, data)
     except WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
@@ -236,7 +236,7 @@ def _shown_splats(path: Path, document: dict[str, Any]) -> tuple[list[tuple[dict
     if not showing:
         return [(each, np.eye(4)) for own in splats.values() for each in own], 0
     parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", [])}
-    shown = [(each, _node_matrix(nodes, parents, index)) for index, mesh in showing for each in splats[mesh]]
+    shown = [(each, _node_matrix(nodes, parents, index, np.eye(4))) for index, mesh in showing for each in splats[mesh]]
     return shown, sum(len(own) for mesh, own in splats.items() if mesh not in {mesh for _, mesh in showing})
 
 
@@ -268,11 +268,11 @@ def _part(
     tag = extras_tag(primitive.get("extras"), "the extras of the GLB")
     if compressed:
         start, size = _view(document, compressed["bufferView"], data)
-        spz = FileStart(path, read_bytes(path, start, start + min(size, _HEAD_BYTES)), size)
+        spz = FileStart(path, read_bytes(path, start, start + min(size, _HEAD_BYTES)), size, start)
         header = SPZ_3.read_header(spz)
         if not SPZ_3.matches(spz) or header.count != count:
             raise ValueError(f"SPZ of {header.count} Gaussians in place of {count}")
-        return GlbPart(count, {}, [], frame, tag if tag.reason else header.tag, linear, (start, header))
+        return GlbPart(count, {}, [], frame, tag if tag.reason else header.tag, linear, header)
 
     def accessor(name: str, kind: str) -> Accessor:
         if name not in attributes:
@@ -329,29 +329,15 @@ def _view(document: dict[str, Any], index: int, data: range) -> tuple[int, int]:
     return data.start + start, size
 
 
-@dataclass
-class _Within:
-    """Part of an open scene that is a file of its own."""
-
-    path: Path
-    file: OpenScene
-    start: int
-
-    def read(self, offset: int, buffer: NDArray[np.uint8]) -> None:
-        """Read bytes of the part, starting at `offset`, until a buffer is full."""
-        self.file.read(self.start + offset, buffer)
-
-
-def _node_matrix(nodes: list[dict[str, Any]], parents: dict[int, int], index: int) -> NDArray[np.float64]:
-    """Return the transformation [4, 4] of a node, with those of the nodes above it."""
-    matrix, node = np.eye(4), index
-    with np.errstate(over="ignore", invalid="ignore"):  # the transformation is checked
-        for _ in range(_MAX_DEPTH):
-            matrix = _local_matrix(nodes[node]) @ matrix
-            if node not in parents:
-                return matrix
-            node = parents[node]
-    raise ValueError("the nodes are nested too deeply, or form a cycle")
+@np.errstate(over="ignore", invalid="ignore")  # the transformation is checked
+def _node_matrix(
+    nodes: list[dict[str, Any]], parents: dict[int, int], index: int, below: NDArray[np.float64], depth: int = 0
+) -> NDArray[np.float64]:
+    """Return a transformation [4, 4] below a node after those of the node, and of the nodes above it."""
+    if depth == _MAX_DEPTH:
+        raise ValueError("the nodes are nested too deeply, or form a cycle")
+    matrix = _local_matrix(nodes[index]) @ below
+    return _node_matrix(nodes, parents, parents[index], matrix, depth + 1) if index in parents else matrix
 
 
 def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
@@ -396,10 +382,9 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
                     arrays["sh_rest"][block, index] = values
             arrays["sh_rest"][:, part.coefficients :] = 0
             if part.spz:
-                start, spz = part.spz
                 within = {**arrays, "sh_rest": arrays["sh_rest"][:, : part.coefficients]}
                 assert SPZ_3.read is not None
-                SPZ_3.read(_Within(file.path, file, start), spz, within)
+                SPZ_3.read(file, part.spz, within)
             part.frame.apply(arrays)
             if part.linear:
                 _convert_linear(arrays)

@@ -171,16 +171,12 @@ def write_ply(output: BinaryIO, arrays: Arrays, rendering: Rendering, least_coef
     output.write("\n".join([*lines, "end_header", ""]).encode())
     for part in blocks(count):
         block = {name: array[part] for name, array in arrays.items()}
-        rows = np.zeros((len(block["means"]), len(names)), "<f4")
-        rows[:, :3] = block["means"]
-        rows[:, 6:9] = block["sh_dc"]
-        rest = np.zeros((len(rows), 3, coefficients), np.float32)  # channel-major
+        means, opacities = block["means"], block["opacities"][:, None]
+        rest = np.zeros((len(means), 3, coefficients), np.float32)  # channel-major
         rest[:, :, :stored] = block["sh_rest"].transpose(0, 2, 1)
-        rows[:, 9:-8] = rest.reshape(len(rows), -1)
-        rows[:, -8] = block["opacities"]
-        rows[:, -7:-4] = block["scales"]
-        rows[:, -4:] = block["quats"]
-        output.write(rows.data)
+        shapes = [opacities, block["scales"], block["quats"]]
+        columns = [means, np.zeros_like(means), block["sh_dc"], rest.reshape(len(means), -1), *shapes]
+        output.write(np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4").data)
 
 
 def _matches(start: FileStart) -> bool:
@@ -424,20 +420,17 @@ def ply_tag(header: PlyHeader) -> RenderTag:
     for comment in header.comments:
         if (match := _MODE.fullmatch(comment)) and match[1].lower() in _MODES:
             mode = _MODES[match[1].lower()]
+            reasons.append(f"the comment {comment!r}")
         elif (match := _EPS2D.fullmatch(comment)) and (blur := usable_eps2d(match[1])):
             eps2d = blur
+            reasons.append(f"the comment {comment!r}")
         elif _UNSCENTED.search(comment):
             reason = f"the comment {comment!r} names another projection"
             differs = "renders differ where Gaussians are large or lenses were distorted"
             warnings.append(("by linearized projection (EWA)", f"{reason}; {differs}"))
-            continue
         elif _ABOUT_MODE.search(comment):
             advice = "if the scene was trained antialiased, add --render-mode antialiased"
             warnings.append(("classic unless stated otherwise", f"the comment {comment[:80]!r} is unknown; {advice}"))
-            continue
-        else:
-            continue
-        reasons.append(f"the comment {comment!r}")
     if mode is None and FILTER_3D in names:
         mode = "antialiased"
         reasons.append(f"the property {FILTER_3D} of Mip-Splatting")

@@ -117,6 +117,7 @@ class SpzHeader(SceneHeader):
     """Header of an SPZ file.
 
     Attributes:
+        offset: Byte offset of version 1 to 3 in the file, which may be a GLB.
         version: Version of the format, 1 to 4.
         fractional_bits: Fractional bits of the fixed-point positions; unused in version 1, which has 16-bit floats.
         degree: SH degree of the file, 0 to 4.
@@ -131,6 +132,7 @@ class SpzHeader(SceneHeader):
     """
 
     size: int
+    offset: int
     version: int
     degree: int
     fractional_bits: int
@@ -280,7 +282,7 @@ def _shared_fields(start: FileStart, head: bytes, versions: tuple[int, ...]) -> 
     drawn, extended = COEFFICIENTS[min(degree, 3)], bool(head[14] & _HAS_EXTENSIONS)
     unknown = head[14] & ~(_ANTIALIASED | _HAS_EXTENSIONS)
     notes = (f"the flags {unknown:#x} of the SPZ header are unknown and ignored",) if unknown else ()
-    fields = (count, drawn, start.size, version, degree, fractional_bits, sections)
+    fields = (count, drawn, start.size, start.offset, version, degree, fractional_bits, sections)
     return SpzHeader(SPZ, *fields, extended=extended, notes=notes)
 
 
@@ -315,7 +317,7 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> SpzHeader:
     axes, notes = spz.stated_axes, spz.notes
     if not spz.streams:
         axes, more, end = _extensions(path, stream, spz)
-        notes += (*more, *about_part(path, end, spz.size))
+        notes += (*more, *about_part(path, end, spz.offset + spz.size))
     if spz.requested != "auto":
         axes = spz.requested
     elif axes is None:
@@ -380,7 +382,7 @@ class _Stream:
     """
 
     def __init__(self, file: OpenScene, spz: SpzHeader) -> None:
-        self.source = _Part(file, 0, spz.size)
+        self.source = _Part(file, spz.offset, spz.size)
         self.inflate = zlib.decompressobj(31) if spz.zipped else None
 
     def read(self, count: int) -> bytes:
