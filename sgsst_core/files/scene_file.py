@@ -65,7 +65,9 @@ READ_BYTES = 1 << 20
 HELD_BYTES = 1 << 28
 
 #: Standard 3DGS properties by their names in PLY files: field of `Scene`, and column of its tensor.
-_STANDARD = {name: (field, column) for field, names in PROPERTIES.items() for column, name in enumerate(names)}
+_STANDARD = {name: (field, column) for field, names in PROPERTIES.items() for column, name in enumerate(names)} | {
+    "opacity": ("opacities", 0)
+}
 #: Distance between positions, relative to a Gaussian's standard deviation, above which rounding moves it visibly.
 _COARSE = 4.0
 #: Names of arrays in notes.
@@ -395,15 +397,13 @@ def read_property(file: SceneFile, name: str) -> Tensor:
     Raises:
         SceneError: If the file has no such numeric property, or has changed since it was read.
     """
-    if name == "opacity":
-        return file.scene.opacities
     if name in _STANDARD:
         field, column = _STANDARD[name]
-        values: Tensor = getattr(file.scene, field)
+        values: Tensor = getattr(file.scene, field).reshape(len(file.scene), -1)
         return values[:, column]
     header = file.header
     if header is None or name not in header.vertex.kinds:
-        known = sorted({*_STANDARD, "opacity", *(header.vertex.kinds if header else ())})
+        known = sorted({*_STANDARD, *(header.vertex.kinds if header else ())})
         raise SceneError(f"{file.path}: its Gaussians have no property {name!r}. There are {', '.join(known)}.")
     if header.text:
         rows = text_vertices(file.path, header)[name]

@@ -26,7 +26,6 @@ import re
 import struct
 import zipfile
 import zlib
-from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -502,8 +501,6 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
         vectors = meta["shN"].get("count")
         if vectors is not None and (type(vectors) is not int or vectors < 1):
             raise ValueError(f"count of shN: {vectors}")
-        if COEFFICIENTS.get(meta["shN"].get("bands"), coefficients) != coefficients:
-            raise ValueError(f"bands: {meta['shN']['bands']} with {coefficients} coefficients")
     extras = meta["extras"] if isinstance(meta.get("extras"), dict) else {}
     model = meta.get("model", "antialiased" if meta.get("antialias") is True else "default")
     tag = extras_tag({**extras, "model": model}, "meta.json")
@@ -798,7 +795,7 @@ def _levels(index: dict[str, Any]) -> dict[str, tuple[int | None, list[tuple[int
     names, most = index["filenames"], index["lodLevels"]
     if len(names) > _MAX_PARTS:
         raise ValueError(f"{len(names)} files, of at most {_MAX_PARTS}")
-    ranges: dict[tuple[str, int], list[tuple[int, int]]] = defaultdict(list)
+    parts: dict[str, tuple[int | None, list[tuple[int, int]]]] = {}
     nodes = [index["tree"]]
     while nodes:
         node = nodes.pop()
@@ -807,13 +804,11 @@ def _levels(index: dict[str, Any]) -> dict[str, tuple[int | None, list[tuple[int
             file, offset, count = numbers = [range_[name] for name in ("file", "offset", "count")]
             if not all(type(value) is int and value >= 0 for value in numbers) or not 0 <= int(level) < most:
                 raise ValueError(f"level {level} of {most}: {range_}")
-            ranges[_folder(names[file]), int(level)].append((offset, count))
-    order = {name: number for number, name in enumerate(map(_folder, names))}
-    parts: dict[str, tuple[int | None, list[tuple[int, int]]]] = {
-        folder: (level, spans) for (folder, level), spans in sorted(ranges.items(), key=lambda item: order[item[0][0]])
-    }
-    if len(parts) != len(ranges):
-        raise ValueError("a file has several levels")
+            own, spans = parts.setdefault(_folder(names[file]), (int(level), []))
+            if own != int(level):
+                raise ValueError("a file has several levels")
+            spans.append((offset, count))
+    parts = {folder: parts[folder] for folder in map(_folder, names) if folder in parts}
     if index.get("environment"):
         folder = _folder(index["environment"])
         if folder in parts:
