@@ -53,6 +53,7 @@ from sgsst_core.files.formats.scene_format import (
     read_bytes,
     read_rows,
     truncated,
+    whole_number,
 )
 from sgsst_core.files.formats.spz import SPZ_3
 from sgsst_core.scene.rendering import Rendering
@@ -255,10 +256,7 @@ def _part(
             )
     attributes = primitive["attributes"]
     refuse_changed_meaning(path, attributes)
-    count = document["accessors"][attributes["POSITION"]]["count"]
-    if type(count) is not int or count < 1:
-        raise ValueError(f"count: {count}")
-
+    count = whole_number("count", document["accessors"][attributes["POSITION"]]["count"], 1)
     compressed = (declared.get("extensions") or {}).get(_SPZ)
     local = Y_UP if compressed else np.eye(4)  # an SPZ is read in the axes of a PLY
     try:
@@ -293,9 +291,7 @@ def _part(
 
 def _about_rest(path: Path, document: dict[str, Any], data: range) -> list[str]:
     """Return notes on bytes after the declared data, in its chunk and after it."""
-    declared = document["buffers"][0].get("byteLength", len(data))
-    if type(declared) is not int or declared < 0:
-        raise ValueError(f"byteLength: {declared}")
+    declared = whole_number("byteLength", document["buffers"][0].get("byteLength", len(data)))
     spans = [(data.start + declared, data.stop), (data.stop, path.stat().st_size)]
     return [note for span in spans for note in about_part(path, *span)]
 
@@ -308,10 +304,8 @@ def _accessor(document: dict[str, Any], index: int, shape: str, count: int, data
     start, size = _view(document, entry["bufferView"], data)
     code = _TYPES[entry["componentType"]]
     kind = np.dtype((code, (_COMPONENTS[shape],)))
-    stride = document["bufferViews"][entry["bufferView"]].get("byteStride", kind.itemsize)
-    first = entry.get("byteOffset", 0)
-    if any(type(number) is not int or number < 0 for number in (stride, first)):
-        raise ValueError(f"accessor {index}: {entry}, stride {stride}")
+    stride = whole_number("stride", document["bufferViews"][entry["bufferView"]].get("byteStride", kind.itemsize))
+    first = whole_number("byteOffset", entry.get("byteOffset", 0))
     if first + (count - 1) * stride + kind.itemsize > size or not kind.itemsize <= stride <= _MAX_STRIDE:
         raise ValueError(f"accessor {index}: {count} values are more than its {size} bytes can hold")
     largest = _LARGEST.get(code) if entry.get("normalized", False) else None
@@ -323,8 +317,9 @@ def _view(document: dict[str, Any], index: int, data: range) -> tuple[int, int]:
     view = document["bufferViews"][index]
     if view.get("buffer") != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
         raise ValueError(f"buffer view {index} is not in the file, or compressed")
-    start, size = view.get("byteOffset", 0), view["byteLength"]
-    if any(type(number) is not int or number < 0 for number in (start, size)) or start + size > len(data):
+    start = whole_number("byteOffset", view.get("byteOffset", 0))
+    size = whole_number("byteLength", view["byteLength"])
+    if start + size > len(data):
         raise ValueError(f"buffer view {index}: {view}, more than its {len(data)} bytes can hold")
     return data.start + start, size
 

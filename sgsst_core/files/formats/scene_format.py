@@ -229,6 +229,17 @@ def json_numbers(values: Any, count: int) -> NDArray[np.float64]:
     return np.array(numbers, np.float64)
 
 
+def whole_number(name: str, value: Any, least: int = 0) -> int:
+    """Return an integer of a parsed JSON document.
+
+    Raises:
+        ValueError: If it is less than `least`, or of another type, such as a truth value.
+    """
+    if type(value) is not int or value < least:
+        raise ValueError(f"{name}: {value}")
+    return value
+
+
 def blocks(count: int) -> Iterator[slice]:
     """Yield the slices of `count` Gaussians that are converted at a time."""
     for start in range(0, count, BLOCK_ROWS):

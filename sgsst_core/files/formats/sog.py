@@ -59,6 +59,7 @@ from sgsst_core.files.formats.scene_format import (
     opacity_bytes,
     read_bytes,
     to_steps,
+    whole_number,
     with_largest,
     without_largest,
     without_padding,
@@ -485,9 +486,7 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
     for name, own in names.items():
         if type(own) is not list or len(own) != _IMAGES[name] or not all(_NAME.fullmatch(each) for each in own):
             raise ValueError(f"files of {name}: {own}")
-    count = meta["count"] if version == 2 else meta["means"]["shape"][0]
-    if type(count) is not int or count < 1:
-        raise ValueError(f"count: {count}")
+    count = whole_number("count", meta["count"] if version == 2 else meta["means"]["shape"][0], 1)
     bounds = np.stack([json_numbers(meta["means"][side], 3) for side in ("mins", "maxs")])
     table = _codebook if version == 2 else _steps
     scales, colors = table(meta["scales"], 3), table(meta["sh0"], 4)
@@ -498,9 +497,8 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
         if width not in _COEFFICIENTS_BY_WIDTH:
             raise ValueError(f"width of {names['shN'][0]}: {width}")
         coefficients, harmonics = _COEFFICIENTS_BY_WIDTH[width], table(meta["shN"], 1)[0]
-        vectors = meta["shN"].get("count")
-        if vectors is not None and (type(vectors) is not int or vectors < 1):
-            raise ValueError(f"count of shN: {vectors}")
+        if meta["shN"].get("count") is not None:
+            vectors = whole_number("count of shN", meta["shN"]["count"], 1)
     extras = meta["extras"] if isinstance(meta.get("extras"), dict) else {}
     model = meta.get("model", "antialiased" if meta.get("antialias") is True else "default")
     tag = extras_tag({**extras, "model": model}, "meta.json")
