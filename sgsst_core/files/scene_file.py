@@ -185,9 +185,7 @@ def read_scene(
         for block in blocks(header.count):
             columns.check(block.start, block.stop - block.start)
     elif ply is not None and ply.text:
-        rows = text_vertices(path, ply)
-        for block in blocks(header.count):
-            columns.take(block.start, rows[block])
+        columns.take(0, text_vertices(path, ply))
     elif ply is not None:
         _read_binary(file, ply, offset, columns)
     file.check_unchanged(stamp)

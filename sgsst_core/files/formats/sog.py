@@ -842,9 +842,8 @@ def _read_streamed(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneH
     with _opened_levels(file.path) as (files, _):
         for part, rows in header.rows:
             arrays = {name: array[rows] for name, array in into.items()}
-            if "sh_rest" in arrays:
-                arrays["sh_rest"][:, part.header.coefficients :] = 0
-                arrays["sh_rest"] = arrays["sh_rest"][:, : part.header.coefficients]
+            arrays["sh_rest"][:, part.header.coefficients :] = 0
+            arrays["sh_rest"] = arrays["sh_rest"][:, : part.header.coefficients]
             read_sog(files.part(part.folder), part.header, arrays)
     notes = (note for part, _ in header.rows for note in part.header.notes)
     return replace(header, notes=tuple(dict.fromkeys((*header.notes, *notes))))

@@ -169,7 +169,7 @@ def _old_header(file_start: FileStart) -> SpzHeader:
         raise SceneError(f"{path}: is a damaged gzip file: {error}. Copy or export it again.") from error
     if not start.startswith(_MAGIC) and not _MAGIC.startswith(start):
         raise SceneError(f"{path}: is a gzip file, but no SPZ scene. Unpack it first (gunzip), and give what is in it.")
-    header = _shared_fields(file_start, start, (1, 2, 3))
+    header = _shared_fields(file_start, start, 16, (1, 2, 3))
     needed = 16 + sum(header.sections)
     if needed > (_DEFLATE_RATIO if zipped else 1) * header.size:
         declared = f"the header declares {header.count} Gaussians, which take {needed} bytes"
@@ -180,9 +180,7 @@ def _old_header(file_start: FileStart) -> SpzHeader:
 def _zstd_header(file_start: FileStart) -> SpzHeader:
     """Read the header of version 4, which is uncompressed and followed by one zstd stream per section."""
     path, head, size = file_start.path, file_start.head, file_start.size
-    header = _shared_fields(file_start, head, (4,))
-    if len(head) < 32:
-        raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
+    header = _shared_fields(file_start, head, 32, (4,))
     number, table = head[15], int.from_bytes(head[16:20], "little")
     expected = [section for section in header.sections if section]
     if number != len(expected) or table < 32 or table + 16 * number > size:
@@ -247,10 +245,10 @@ def _parsed_extensions(path: Path, data: bytes, spz: SpzHeader) -> tuple[str | N
     return axes, (*notes, *about_surplus(rest, "byte")), rest
 
 
-def _shared_fields(start: FileStart, head: bytes, versions: tuple[int, ...]) -> SpzHeader:
-    """Parse the header fields that all versions share."""
+def _shared_fields(start: FileStart, head: bytes, least: int, versions: tuple[int, ...]) -> SpzHeader:
+    """Parse the fields that all versions share, of a header of at least some bytes."""
     path = start.path
-    if len(head) < 16:
+    if len(head) < least:
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
     version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)
     if version not in versions:
