@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +79,7 @@ SPLAT = SceneFormat("splat", ".splat", 32, _matches, _read_header, _read)
 
 #: Version 0.1, the only one.
 _MAGIC = b"\0\1\0\0"
-_HEADER_BYTES, _SECTION_BYTES = 4096, 1024
+_HEADER_BYTES = 4096
 _MAX_SECTIONS = 1024
 _MAX_DEGREE = 2
 #: NumPy type codes of positions, of scales and rotations, and of SH coefficients, by compression level.
@@ -91,31 +92,20 @@ _ORDER = np.concatenate([np.arange(9).reshape(3, 3).T, 9 + np.arange(15).reshape
 _MIN_LOG_SCALE = math.log(2.0**-25)
 
 
-@dataclass(frozen=True)
-class KsplatSection:
-    """Section of a .ksplat file.
-
-    Attributes:
-        degree: SH degree, 0 to 2.
-        lengths_offset: Byte offset of the numbers of Gaussians in buckets that are not full (uint32).
-        full: Number of full buckets, which come first.
-        partial: Number of other buckets.
-        bucket_size: Number of Gaussians in a full bucket.
-        centers_offset: Byte offset of the centers of the buckets, three float32 each.
-        step: Position step.
-        steps: Steps from the least position in a bucket to its center.
-    """
-
-    count: int
-    degree: int
-    lengths_offset: int
-    full: int
-    partial: int
-    bucket_size: int
-    centers_offset: int
-    step: float
-    steps: int
-    data_offset: int
+#: Entry of a section: its Gaussians, and those that it has memory for; Gaussians of a full bucket; buckets; side of a
+#: bucket; bytes of its center; steps from the least position in a bucket to its center; numbers of full buckets, which
+#: come first, and of others; SH degree.
+_SECTION = np.dtype(
+    {
+        "names": [
+            *("count", "most", "bucket_size", "buckets", "side"),
+            *("center_bytes", "steps", "full", "partial", "degree"),
+        ],
+        "formats": ["<u4", "<u4", "<u4", "<u4", "<f4", "<u2", "<u4", "<u4", "<u4", "<u2"],
+        "offsets": [0, 4, 8, 12, 16, 20, 24, 32, 36, 40],
+        "itemsize": 1024,
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -125,12 +115,13 @@ class KsplatHeader(SceneHeader):
     Attributes:
         level: Compression level, 0 to 2.
         harmonics: Lowest and highest SH coefficient at level 2.
-        sections: Sections that hold Gaussians.
+        sections: Entries of the sections, and their byte offset as `start`. A section has the numbers of Gaussians in
+            buckets that are not full (uint32), the centers of the buckets (three float32 each), and the Gaussians.
     """
 
     level: int
     harmonics: tuple[float, float]
-    sections: list[KsplatSection]
+    sections: list[dict[str, Any]]
 
 
 def _matches_ksplat(start: FileStart) -> bool:
@@ -147,44 +138,37 @@ def _read_ksplat_header(start: FileStart) -> KsplatHeader:
     path, head = start.path, start.head
     sections, _, _, count, level = struct.unpack_from("<IIIIH", head, 4)
     low, high = struct.unpack_from("<2f", head, 36)
-    table_end = _HEADER_BYTES + _SECTION_BYTES * sections
+    table_end = _HEADER_BYTES + _SECTION.itemsize * sections
     if sections > _MAX_SECTIONS or table_end > start.size:
         declared = f"the .ksplat header declares {sections} sections in {start.size} bytes"
         raise truncated(path, f"{declared}; at most {_MAX_SECTIONS} can be read")
-    table = read_bytes(path, _HEADER_BYTES, table_end)
+    table = np.frombuffer(read_bytes(path, _HEADER_BYTES, table_end), _SECTION)
     read, position = [], table_end
-    for index in range(sections):
-        section, position = _section(table[index * _SECTION_BYTES :][:_SECTION_BYTES], level, position)
-        if section is None or position > start.size:
+    for index, entry in enumerate(table.tolist()):
+        section: dict[str, Any] = dict(zip(_SECTION.names or (), entry, strict=True)) | {"start": position}
+        degree, count_of, side = (section[name] for name in ("degree", "count", "side"))
+        fits = degree <= _MAX_DEGREE and count_of <= section["most"] and math.isfinite(side)
+        if level and count_of:
+            fits &= section["center_bytes"] == 12 and section["full"] + section["partial"] <= section["buckets"]
+        if fits:
+            position = _data_offset(section) + _row(level, degree).itemsize * section["most"]
+        if not fits or position > start.size:
             raise truncated(path, f"section {index} of the .ksplat file is wrong, or ends after its {start.size} bytes")
         read.append(section)
-    if sum(section.count for section in read) != count:
+    if sum(section["count"] for section in read) != count:
         raise SceneError(
             f"{path}: the .ksplat header declares {count} Gaussians, but its sections hold "
-            f"{sum(section.count for section in read)}: it was not written completely. Export it again."
+            f"{sum(section['count'] for section in read)}: it was not written completely. Export it again."
         )
-    coefficients = COEFFICIENTS[max(section.degree for section in read)]
+    coefficients = COEFFICIENTS[max(section["degree"] for section in read)]
     notes = about_part(path, position, start.size)
     return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read, notes=notes)
 
 
-def _section(entry: bytes, level: int, start: int) -> tuple[KsplatSection | None, int]:
-    """Parse the entry of the section that starts at a byte offset.
-
-    Returns:
-        The section, None if it is wrong, and the byte offset of the next one.
-    """
-    count, most, bucket_size, buckets, block, center_bytes, _, steps = struct.unpack_from("<IIIIfHHI", entry)
-    full, partial, degree = struct.unpack_from("<IIH", entry, 32)
-    if degree > _MAX_DEGREE or count > most or not math.isfinite(block):
-        return None, start
-    if level and count and (center_bytes != 12 or full + partial > buckets):
-        return None, start
-    steps = steps or _STEPS
-    centers = start + 4 * partial
-    data = centers + center_bytes * buckets
-    end = data + _row(level, degree).itemsize * most
-    return KsplatSection(count, degree, start, full, partial, bucket_size, centers, block / 2 / steps, steps, data), end
+def _data_offset(section: dict[str, Any]) -> int:
+    """Return the byte offset of the Gaussians of a section."""
+    offset: int = section["start"] + 4 * section["partial"] + section["center_bytes"] * section["buckets"]
+    return offset
 
 
 def _row(level: int, degree: int) -> np.dtype:
@@ -200,9 +184,9 @@ def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     into["sh_rest"][:] = 0
     first = 0
     for section in header.sections:
-        buckets = _buckets(file, section) if header.level and section.count else None
-        kind = _row(header.level, section.degree)
-        for part, rows in row_blocks(file, kind, section.data_offset, section.count):
+        buckets = _buckets(file, section) if header.level and section["count"] else None
+        kind, steps = _row(header.level, section["degree"]), section["steps"] or _STEPS
+        for part, rows in row_blocks(file, kind, _data_offset(section), section["count"]):
             block = slice(first + part.start, first + part.stop)
             positions = rows["position"].astype(np.float64)
             if buckets is not None:
@@ -212,7 +196,7 @@ def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
                     raise SceneError(
                         f"{file.path}: holds Gaussians beyond its buckets: it is damaged. Export it again."
                     )
-                positions = (positions - section.steps) * section.step + centers[owners]
+                positions = (positions - steps) * (section["side"] / 2 / steps) + centers[owners]
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # invalid values are reported later
                 into["means"][block] = positions
                 scales = logarithms(file.path, rows["scale"].astype(np.float64))
@@ -220,21 +204,23 @@ def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
                 into["quats"][block] = rows["rotation"]
                 into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
                 into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
-                into["sh_rest"][block, : COEFFICIENTS[section.degree]] = _harmonics(rows["harmonics"], header, section)
-        first += section.count
+                harmonics = _harmonics(rows["harmonics"], header, COEFFICIENTS[section["degree"]])
+                into["sh_rest"][block, : harmonics.shape[1]] = harmonics
+        first += section["count"]
 
 
-def _buckets(file: OpenScene, section: KsplatSection) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _buckets(file: OpenScene, section: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the end of each bucket, as an index of Gaussians, and the bucket's center, [buckets, 3]."""
-    lengths = read_rows(file, np.dtype("<u4"), section.lengths_offset, section.partial)
-    centers = read_rows(file, np.dtype("<f4"), section.centers_offset, 3 * (section.full + section.partial))
-    sizes = np.concatenate([np.full(section.full, section.bucket_size, np.int64), lengths.astype(np.int64)])
+    full, partial = section["full"], section["partial"]
+    lengths = read_rows(file, np.dtype("<u4"), section["start"], partial)
+    centers = read_rows(file, np.dtype("<f4"), section["start"] + 4 * partial, 3 * (full + partial))
+    sizes = np.concatenate([np.full(full, section["bucket_size"], np.int64), lengths.astype(np.int64)])
     return sizes.cumsum(), centers.reshape(-1, 3).astype(np.float64)
 
 
-def _harmonics(values: NDArray[np.generic], header: KsplatHeader, section: KsplatSection) -> NDArray[np.float64]:
+def _harmonics(values: NDArray[np.generic], header: KsplatHeader, coefficients: int) -> NDArray[np.float64]:
     """Return SH coefficients [n, coefficients, 3]."""
-    numbers = values.astype(np.float64)[:, _ORDER[: COEFFICIENTS[section.degree]]]
+    numbers = values.astype(np.float64)[:, _ORDER[:coefficients]]
     if header.level != 2:
         return numbers
     low, high = header.harmonics
