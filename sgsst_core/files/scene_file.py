@@ -529,8 +529,8 @@ class SceneColumns:
             counts |= {f"f_rest_{i}": numbers for i, numbers in enumerate(np.sum(self._stored_flaws, axis=0).T)}
         invalid = []
         for name, numbers in counts.items():
-            found = [f"{number} {what}" for number, what in zip(numbers, ("NaN", "infinite"), strict=True) if number]
-            invalid += [f"{name} ({', '.join(found)})"] if found else []
+            kinds = [f"{number} {what}" for number, what in zip(numbers, ("NaN", "infinite"), strict=True) if number]
+            invalid += [f"{name} ({', '.join(kinds)})"] if kinds else []
         unrotated = np.flatnonzero((self.arrays["quats"] == 0).all(axis=1))
         bad = int((~retained).sum())
         flawed = [f"hold NaN or infinite values: {', '.join(invalid)}"] if invalid else []

@@ -50,8 +50,8 @@ from sgsst_core.files.formats.scene_format import (
     about_surplus,
     along_curve,
     blocks,
+    join_bits,
     opacity_bytes,
-    pack_bits,
     read_bytes,
     read_rows,
     refuse_text_transfer,
@@ -663,10 +663,10 @@ def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         fractions.append((values.astype(np.float64) - low[chunk]) / np.where(extent > 0, extent, 1)[chunk])
     largest, three = without_largest(arrays["quats"])
     packed = [
-        pack_bits(fractions[0], _THREE_BITS),
-        pack_bits(np.column_stack([largest / 3, three / np.sqrt(2) + 0.5]), (2, 10, 10, 10)),
-        pack_bits(fractions[1], _THREE_BITS),
-        pack_bits(np.column_stack([fractions[2], opacity_bytes(arrays["opacities"]) / 255]), (8, 8, 8, 8)),
+        join_bits(fractions[0], _THREE_BITS),
+        join_bits(np.column_stack([largest / 3, three / np.sqrt(2) + 0.5]), (2, 10, 10, 10)),
+        join_bits(fractions[1], _THREE_BITS),
+        join_bits(np.column_stack([fractions[2], opacity_bytes(arrays["opacities"]) / 255]), (8, 8, 8, 8)),
     ]
     return np.concatenate(bounds_of, axis=1), np.stack(packed, axis=1)
 

@@ -478,12 +478,12 @@ def to_steps(values: NDArray[Any], maximum: int) -> NDArray[np.uint32]:
     return steps
 
 
-def pack_bits(fractions: NDArray[np.float64], widths: Sequence[int]) -> NDArray[np.uint32]:
-    """Quantize fractions [n, k] in 0..1 to k numbers of some bits, and pack each row, the first in the highest bits."""
-    packed: NDArray[np.uint32] = np.zeros(len(fractions), np.uint32)
+def join_bits(fractions: NDArray[np.float64], widths: Sequence[int]) -> NDArray[np.uint32]:
+    """Quantize fractions [n, k] in 0..1 to k numbers of some bits, and join each row, the first in the highest bits."""
+    joined: NDArray[np.uint32] = np.zeros(len(fractions), np.uint32)
     for column, width in zip(fractions.T, widths, strict=True):
-        packed = packed << np.uint32(width) | to_steps(column, (1 << width) - 1)
-    return packed
+        joined = joined << np.uint32(width) | to_steps(column, (1 << width) - 1)
+    return joined
 
 
 def with_largest(index: NDArray[Any], three: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -49,9 +49,9 @@ from sgsst_core.files.formats.scene_format import (
     about_surplus,
     blocks,
     harmonics_matrix,
+    join_bits,
     number_of,
     opacity_bytes,
-    pack_bits,
     read_bytes,
     read_rows,
     stated,
@@ -543,7 +543,7 @@ def _encode_positions(means: NDArray[np.float64], bits: int) -> NDArray[Any]:
 def _encode_rotations(quats: NDArray[np.float64]) -> NDArray[Any]:
     largest, three = without_largest(np.roll(quats, -1, axis=1))
     components = np.stack([three < 0, np.abs(three) / np.sqrt(0.5)], axis=2).reshape(-1, 6)
-    return pack_bits(np.column_stack([largest / 3, components]), (2, 1, 9, 1, 9, 1, 9)).astype("<u4")
+    return join_bits(np.column_stack([largest / 3, components]), (2, 1, 9, 1, 9, 1, 9)).astype("<u4")
 
 
 def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
