@@ -278,10 +278,7 @@ def write_levels(target: Path, scene: Scene, original: Path) -> int:
         else:
             output = stack.enter_context(atomic_path(target))
         with zipfile.ZipFile(output, "w") as archive:
-            try:
-                write_recolored(original, header, arrays["means"], arrays["sh_dc"], archive)
-            except OutputError as error:
-                raise OutputError(f"{target}: {error}") from error
+            write_recolored(original, header, arrays["means"], arrays["sh_dc"], archive)
         if to_folder:
             with zipfile.ZipFile(output) as archive:
                 for info in archive.infolist():

@@ -407,10 +407,10 @@ def surplus(path: Path, header: PlyHeader) -> tuple[str, ...]:
         rows -= sum(element.count for element in header.elements.values())
         return about_surplus(max(0, rows), "row")
     last = [*header.elements.values()][-1]
-    row_bytes, size = last.dtype.itemsize, path.stat().st_size
-    end = element_offsets(path, header)[last.name] + last.count * row_bytes
+    end = element_offsets(path, header)[last.name] + last.count * last.dtype.itemsize
+    size = path.stat().st_size
     refuse_text_transfer(path, len(header.raw), header.newline, end, size)
-    return about_part(path, end, size, row_bytes)
+    return about_part(path, end, size)
 
 
 def ply_tag(header: PlyHeader) -> RenderTag:

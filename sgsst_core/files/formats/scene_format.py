@@ -280,10 +280,12 @@ def number_of(count: int, unit: str) -> str:
     return f"{count} {unit}" + "s" * (count != 1)
 
 
-def about_surplus(count: int, unit: str, also: str = "") -> tuple[str, ...]:
+def about_surplus(count: int, unit: str) -> tuple[str, ...]:
     """Return the note on content that a header does not declare, such as 12 bytes; nothing if there is none."""
-    surplus = f"{number_of(count, unit)}{also}"
-    note = f"the file has {surplus} more than its header declares, which are not read; copy or export it again"
+    note = (
+        f"the file has {number_of(count, unit)} more than its header declares, which are not read; copy or export it "
+        "again"
+    )
     return (note,) if count else ()
 
 
@@ -292,20 +294,16 @@ def without_padding(data: bytes) -> bytes:
     return data if len(data) > _MAX_PADDING or data.strip(_PADDING) else b""
 
 
-def about_part(path: Path, start: int, end: int, row_bytes: int | None = None) -> tuple[str, ...]:
+def about_part(path: Path, start: int, end: int) -> tuple[str, ...]:
     """Return the note on a part of a file that its header does not declare; nothing if there is only padding.
 
     Args:
         start: Byte offset of the part.
         end: Byte offset of its end.
-        row_bytes: Size of a row before the part; None if rows differ in size.
     """
     if start >= end or not without_padding(read_bytes(path, start, min(end, start + _MAX_PADDING + 1))):
         return ()
-    rows = ""
-    if row_bytes and (end - start) % row_bytes == 0:
-        rows = f" ({number_of((end - start) // row_bytes, 'row')})"
-    return about_surplus(end - start, "byte", rows)
+    return about_surplus(end - start, "byte")
 
 
 def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: int, end: int) -> None:
@@ -324,10 +322,9 @@ def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: i
     changed = newline == b"\r\n" or (line_ends == data.count(b"\r\n") and line_ends >= _MIN_LINE_ENDS)
     blank = not read_bytes(path, start, min(end, start + _MAX_PADDING)).strip(_BLANKS)
     if (changed and not blank) or _is_utf8(data):
-        surplus = number_of(end - start, "byte")
         raise SceneError(
-            f"{path}: has {surplus} more than its header declares. Was it transferred as text, which changes line ends "
-            "and other bytes? Copy it again in binary mode."
+            f"{path}: has {number_of(end - start, 'byte')} more than its header declares. Was it transferred as text, "
+            "which changes line ends and other bytes? Copy it again in binary mode."
         )
 
 

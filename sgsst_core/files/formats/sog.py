@@ -604,7 +604,9 @@ def recolored(files: SogFiles, header: SogHeader, change: NDArray[np.float32]) -
         return stored
     meta, (name,) = json.loads(stored[META_NAME]), header.names["sh0"]
     if meta.get("version") != 2:
-        raise OutputError(f"{files.folder} of it is SOG of version 1. Write it again with splat-transform.")
+        raise OutputError(
+            f"{files.path}: {files.folder}{META_NAME} is SOG of version 1. Write it again with splat-transform."
+        )
     image = files.pixels(name, header.count)
     pixels = image.reshape(-1, 4).copy()
     colors = _looked_up(header.colors, pixels[: header.count]) + change
@@ -895,7 +897,7 @@ def write_recolored(
             own["sh_dc"][rows] = _looked_up(part.header.colors, pixels)
         if not np.array_equal(means, own["means"]):
             raise OutputError(
-                f"the scene's Gaussians are not those of the finest level of {original}, in the same order. Give that "
+                f"The scene's Gaussians are not those of the finest level of {original}, in the same order. Give that "
                 "level with other colors, as a PLY, without --refine."
             )
         change, tree = colors - own["sh_dc"], cKDTree(means)

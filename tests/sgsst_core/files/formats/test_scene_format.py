@@ -257,8 +257,7 @@ def test_rows_beyond_the_declared_ones_are_counted(tmp_path: Path, change: Calla
         return
     path.write_bytes(fewer(data))
     loaded = read_scene(path)
-    row_bytes = 26 * 4
-    counted = "16 rows" if change is as_text else f"{16 * row_bytes} bytes (16 rows)"
+    counted = "16 rows" if change is as_text else f"{16 * 26 * 4} bytes"
     assert (len(loaded.scene), loaded.notes) == (600, (NOTE.format(counted),))
     write_stylized(loaded, tmp_path / "out.ply", torch.zeros(600, 3))
     assert read_scene(tmp_path / "out.ply").notes == loaded.notes
