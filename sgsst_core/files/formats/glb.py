@@ -177,7 +177,8 @@ def _read_header(start: FileStart) -> GlbHeader:
         linear = "colors are linear, and converted to sRGB for each Gaussian; where Gaussians overlap, renders differ"
         notes += [linear] if any(part.linear for part in parts) else []
         notes += [note for part in parts if part.spz for note in part.spz.notes]
-        notes += _about_rest(path, document, data)
+        declared = whole_number("byteLength", document["buffers"][0].get("byteLength", len(data)))
+        notes += (*about_part(path, data.start + declared, data.stop), *about_part(path, data.stop, start.size))
     except WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
     count = sum(part.count for part in parts)
@@ -287,13 +288,6 @@ def _part(
         tag,
         linear,
     )
-
-
-def _about_rest(path: Path, document: dict[str, Any], data: range) -> list[str]:
-    """Return notes on bytes after the declared data, in its chunk and after it."""
-    declared = whole_number("byteLength", document["buffers"][0].get("byteLength", len(data)))
-    spans = [(data.start + declared, data.stop), (data.stop, path.stat().st_size)]
-    return [note for span in spans for note in about_part(path, *span)]
 
 
 def _accessor(document: dict[str, Any], index: int, shape: str, count: int, data: range) -> Accessor:
