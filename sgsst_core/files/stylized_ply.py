@@ -164,19 +164,13 @@ def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> dict[s
 
 def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
     """Yield, for each block of file rows, its length, the number of copies of each row, and the slice of Gaussians."""
-    position = gaussian = 0
+    times = np.ones(rows, np.int64) if source.retained is None else source.retained.astype(np.int64)
+    if source.copies is not None:
+        times[times > 0] = source.copies
+    ends = np.append(0, times.cumsum())
     for start in range(0, rows, BLOCK_ROWS):
-        count = min(BLOCK_ROWS, rows - start)
-        times = np.ones(count, np.int64)
-        if source.retained is not None:
-            times[:] = source.retained[start : start + count]
-        if source.copies is not None:
-            present = times.nonzero()[0]
-            times[present] = source.copies[position : position + len(present)]
-            position += len(present)
-        following = gaussian + int(times.sum())
-        yield count, times, slice(gaussian, following)
-        gaussian = following
+        stop = min(start + BLOCK_ROWS, rows)
+        yield stop - start, times[start:stop], slice(ends[start], ends[stop])
 
 
 def _write_binary(
@@ -352,13 +346,10 @@ def check_same_shape(first: SceneFile, file: SceneFile) -> None:
 
 def common_rests(scenes: Sequence[Scene]) -> list[Tensor]:
     """Return the coefficients above degree 0 of each scene, with zeros for bands that only others have."""
-    most = max(scene.sh_rest.shape[1] for scene in scenes)
-    rests = []
-    for scene in scenes:
-        rest = held(scene.sh_rest)
-        missing = rest.new_zeros(len(rest), most - rest.shape[1], 3)
-        rests.append(torch.cat([rest, missing], dim=1) if missing.numel() else rest)
-    return rests
+    rests = [held(scene.sh_rest) for scene in scenes]
+    missing = [max(rest.shape[1] for rest in rests) - rest.shape[1] for rest in rests]
+    pad = torch.nn.functional.pad
+    return [pad(rest, (0, 0, 0, more)) if more else rest for rest, more in zip(rests, missing, strict=True)]
 
 
 def _weighted_sum(tensors: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
