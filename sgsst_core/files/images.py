@@ -396,8 +396,10 @@ _PRIMARIES = {
 _SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 _REC_709_CURVE = (1 / 0.45, 1 / 1.099, 0.099 / 1.099, 1 / 4.5, 0.081)
 #: Parameters of `_matrix_profile` by the numbers of ITU-T H.273, table 3.
-_CURVES: dict[int, tuple[float, ...]] = {4: (2.2,), 5: (2.8,), 8: (1.0,), 13: _SRGB_CURVE}
-_CURVES |= dict.fromkeys((1, 6, 14, 15), _REC_709_CURVE)
+_CURVES: dict[int, tuple[float, ...]] = {
+    **{4: (2.2,), 5: (2.8,), 8: (1.0,), 13: _SRGB_CURVE},
+    **dict.fromkeys((1, 6, 14, 15), _REC_709_CURVE),
+}
 #: Exponent that stands for sRGB with its primaries, as the specification of PNG recommends, and rounding.
 _SRGB_GAMMA, _GAMMA_ROUNDING, _PRIMARY_ROUNDING = 2.2, 0.02, 0.001
 #: Exponents of curves that are believed.

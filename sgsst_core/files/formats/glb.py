@@ -406,8 +406,7 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     Frame.of(Y_UP).apply(arrays)
     columns = _columns(arrays)
     data_bytes = sum(column.nbytes for _, column in columns)
-    document = _document(columns, data_bytes, extras_of(rendering))
-    text = json.dumps(document).encode()
+    text = json.dumps(_document(columns, data_bytes, extras_of(rendering))).encode()
     text += b" " * (-len(text) % 4)
     length = _HEADER.size + 2 * _CHUNK.size + len(text) + data_bytes
     if length > _MAX_BYTES:
@@ -432,12 +431,12 @@ def _columns(arrays: Arrays) -> list[tuple[str, NDArray[Any]]]:
         "opacities": opacities[:, None],
         "sh_dc": arrays["sh_dc"],
     }
-    columns: list[tuple[str, NDArray[Any]]] = [
-        (_ATTRIBUTES[name][0], each.astype("<f4")) for name, each in values.items()
+    harmonics = zip(_HARMONICS, arrays["sh_rest"].swapaxes(0, 1), strict=False)
+    return [
+        *((_ATTRIBUTES[name][0], each.astype("<f4")) for name, each in values.items()),
+        *((name, each.astype("<f4")) for name, each in harmonics),
+        ("COLOR_0", np.rint(255 * np.column_stack([linear, opacities])).astype(np.uint8)),
     ]
-    harmonics = arrays["sh_rest"].shape[1]
-    columns += [(_HARMONICS[index], arrays["sh_rest"][:, index].astype("<f4")) for index in range(harmonics)]
-    return [*columns, ("COLOR_0", np.rint(255 * np.column_stack([linear, opacities])).astype(np.uint8))]
 
 
 def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int, extras: dict[str, Any]) -> dict[str, Any]:
@@ -447,8 +446,9 @@ def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int, extras: 
     names = {components: name for name, components in _COMPONENTS.items()}
     for index, (_, column) in enumerate(columns):
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": column.nbytes, "target": _ARRAY_BUFFER})
-        kind = names[column.shape[1]]
-        accessors.append({"bufferView": index, "componentType": _FLOAT, "count": len(column), "type": kind})
+        accessors.append(
+            {"bufferView": index, "componentType": _FLOAT, "count": len(column), "type": names[column.shape[1]]}
+        )
         offset += column.nbytes
     accessors[0] |= {"min": columns[0][1].min(axis=0).tolist(), "max": columns[0][1].max(axis=0).tolist()}
     accessors[-1] |= {"componentType": _BYTE, "normalized": True}

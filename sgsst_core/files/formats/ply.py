@@ -164,11 +164,16 @@ def write_ply(output: BinaryIO, arrays: Arrays, rendering: Rendering, least_coef
     """
     count, stored = arrays["sh_rest"].shape[:2]
     coefficients = max(stored, least_coefficients)
-    names = [*PROPERTIES["means"], "nx", "ny", "nz", *PROPERTIES["sh_dc"]]
-    names += [*(f"f_rest_{i}" for i in range(3 * coefficients)), "opacity", *PROPERTIES["scales"], *PROPERTIES["quats"]]
-    lines = ["ply", "format binary_little_endian 1.0", *comment_lines(rendering), f"element vertex {count}"]
-    lines += [f"property float {name}" for name in names]
-    output.write("\n".join([*lines, "end_header", ""]).encode())
+    names = [
+        *(*PROPERTIES["means"], "nx", "ny", "nz", *PROPERTIES["sh_dc"]),
+        *(*(f"f_rest_{i}" for i in range(3 * coefficients)), "opacity", *PROPERTIES["scales"], *PROPERTIES["quats"]),
+    ]
+    lines = [
+        *("ply", "format binary_little_endian 1.0", *comment_lines(rendering)),
+        *(f"element vertex {count}", *(f"property float {name}" for name in names)),
+        *("end_header", ""),
+    ]
+    output.write("\n".join(lines).encode())
     for part in blocks(count):
         block = {name: array[part] for name, array in arrays.items()}
         means, opacities = block["means"], block["opacities"][:, None]
@@ -203,15 +208,10 @@ FILTER_3D = "filter_3D"
 _MIP_EPS2D = 0.1
 
 _MODES = {
-    "mip": "antialiased",
-    "default": "classic",
-    "2dgs": "2dgs",
-    "antialiased": "antialiased",
-    "classic": "classic",
+    **{"mip": "antialiased", "default": "classic", "2dgs": "2dgs", "antialiased": "antialiased", "classic": "classic"},
+    **dict.fromkeys(("1", "true", "yes", "on"), "antialiased"),
+    **dict.fromkeys(("0", "false", "no", "off"), "classic"),
 }
-_MODES |= dict.fromkeys(("1", "true", "yes", "on"), "antialiased") | dict.fromkeys(
-    ("0", "false", "no", "off"), "classic"
-)
 _IS = r"(?:\s*[:=]\s*|\s+|\|\w{1,9}\|)(\S+)"
 _MODE = re.compile(
     r"[\w.|]*?(?:(?:render|raster)[a-z]{0,9}[-_ ]?mode|anti[-_ ]?alias(?:ed|ing)?|(?<![a-z])mip(?:[-_ ]?splatting)?)"
@@ -637,13 +637,15 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
 
 
 def _header(count: int, coefficients: int, rendering: Rendering) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", *comment_lines(rendering)]
-    lines += [f"element chunk {-(-count // CHUNK_ROWS)}"]
-    lines += [f"property float {name}" for name in _BOUNDS]
-    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
-    if coefficients:
-        lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(3 * coefficients))]
-    return "\n".join([*lines, "end_header", ""]).encode()
+    harmonics = [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(3 * coefficients))]
+    lines = [
+        *("ply", "format binary_little_endian 1.0", *comment_lines(rendering)),
+        *(f"element chunk {-(-count // CHUNK_ROWS)}", *(f"property float {name}" for name in _BOUNDS)),
+        *(f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)),
+        *(harmonics if coefficients else []),
+        *("end_header", ""),
+    ]
+    return "\n".join(lines).encode()
 
 
 def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:

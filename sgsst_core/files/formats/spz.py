@@ -82,8 +82,10 @@ _ZSTD_RATIO = (1 << 17) // 4
 
 #: Type of the extension record that states the axes, and its numbers for them; 0 stands for the library's default.
 _AXES_EXTENSION = 0xADBE0003
-_AXES = ["rub", "ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"]
-_AXES += ["lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu"]
+_AXES = [
+    *("rub", "ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"),
+    *("lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu"),
+]
 #: Directions of axes in those of a PLY, by the letters of names.
 _DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "d": (0, 1, 0), "u": (0, -1, 0), "f": (0, 0, 1), "b": (0, 0, -1)}
 _ANTIALIASED, _HAS_EXTENSIONS, _LEVELS = 1, 2, 0x80
