@@ -82,10 +82,9 @@ def has_model(folder: Path) -> bool:
 def _named(folder: Path) -> Path | None:
     """Return the first COLMAP model or JSON file in a folder that has one of the usual names; None if there is none."""
     sparse = folder / "sparse"
-    models = [model for model in (folder, sparse / "0", sparse, *_numbered(sparse)) if has_model(model)]
-    files = [folder / name for name in _JSON_NAMES if (folder / name).is_file()]
-    other = [model for model in (folder / "colmap" / "sparse" / "0",) if has_model(model)]
-    return next(iter([*models, *files, *other]), None)
+    files = [folder / name for name in _JSON_NAMES]
+    usual = [folder, sparse / "0", sparse, *_numbered(sparse), *files, folder / "colmap" / "sparse" / "0"]
+    return next((each for each in usual if has_model(each) or (each in files and each.is_file())), None)
 
 
 def load_json(path: Path) -> Any:
@@ -299,8 +298,6 @@ def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
         raise CameraError(f"{path}: cannot be read: {error.strerror}. Copy the model again.") from error
     except KeyError as error:
         raise CameraError(f"{path}: has an unknown COLMAP camera model, number {error}. {_CONVERT}.") from error
-    except EOFError as error:
-        raise CameraError(f"{path}: is truncated or corrupt: {error}. Copy the model again.") from error
     except (struct.error, ValueError) as error:
         raise CameraError(f"{path}: is truncated or corrupt. Copy the model again.") from error
     return by_id
@@ -316,7 +313,10 @@ def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]], wa
             except (struct.error, EOFError):
                 position = len(data) + 1
             if position > len(data):
-                raise EOFError(f"it declares {count:,} {path.stem} and ends after {done:,}")
+                raise CameraError(
+                    f"{path}: is truncated or corrupt: it declares {count:,} {path.stem} and ends after {done:,}. Copy "
+                    "the model again."
+                )
             yield number, entry
         if position < len(data):
             left = len(data) - position
