@@ -451,7 +451,6 @@ class SceneColumns:
 
     def __init__(self, header: SceneHeader, stored: RowLayout | None) -> None:
         ply = header if isinstance(header, PlySceneHeader) else None
-        names = set(ply.ply.vertex.kinds) if ply else set()
         count, coefficients = header.count, 0 if stored else header.coefficients
         self._stored = stored
         self._sources = ply.sources if ply else {}
@@ -467,8 +466,7 @@ class SceneColumns:
         stride = ply.stored_coefficients if ply else coefficients
         for channel, i in itertools.product(range(3), range(coefficients)):
             self._targets[f"f_rest_{channel * stride + i}"] = self.arrays["sh_rest"][:, i, channel]
-        self._filtered = FILTER_3D in names
-        if is_flat(names) and "scale_2" not in self._sources:
+        if ply and is_flat(ply.ply.vertex.kinds) and "scale_2" not in self._sources:
             self._targets.pop("scale_2")[:] = FLAT
         self.retained = np.ones(count, np.bool_)
         self.clamped: list[int] = []
@@ -481,7 +479,7 @@ class SceneColumns:
             for name, target in self._targets.items():
                 source = self._sources.get(name, name)
                 target[block] = (rows[source] / 255 - COLOR_OFFSET) / SH_C0 if source in RGB else rows[source]
-        if self._filtered:
+        if FILTER_3D in (rows.dtype.names or ()):
             apply_filter(self.arrays["scales"][block], self.arrays["opacities"][block], rows[FILTER_3D])
         self.check(start, len(rows), rows)
 

@@ -115,8 +115,9 @@ class KsplatHeader(SceneHeader):
     Attributes:
         level: Compression level, 0 to 2.
         harmonics: Lowest and highest SH coefficient at level 2.
-        sections: Entries of the sections, and their byte offset as `start`. A section has the numbers of Gaussians in
-            buckets that are not full (uint32), the centers of the buckets (three float32 each), and the Gaussians.
+        sections: Entries of the sections, and the byte offsets of their `start` and `data`. A section has the numbers
+            of Gaussians in buckets that are not full (uint32), the centers of the buckets (three float32 each), and
+            the data of Gaussians.
     """
 
     level: int
@@ -151,7 +152,8 @@ def _read_ksplat_header(start: FileStart) -> KsplatHeader:
         if level and count_of:
             fits &= section["center_bytes"] == 12 and section["full"] + section["partial"] <= section["buckets"]
         if fits:
-            position = _data_offset(section) + _row(level, degree).itemsize * section["most"]
+            section["data"] = position + 4 * section["partial"] + section["center_bytes"] * section["buckets"]
+            position = section["data"] + _row(level, degree).itemsize * section["most"]
         if not fits or position > start.size:
             raise truncated(path, f"section {index} of the .ksplat file is wrong, or ends after its {start.size} bytes")
         read.append(section)
@@ -163,12 +165,6 @@ def _read_ksplat_header(start: FileStart) -> KsplatHeader:
     coefficients = COEFFICIENTS[max(section["degree"] for section in read)]
     notes = about_part(path, position, start.size)
     return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read, notes=notes)
-
-
-def _data_offset(section: dict[str, Any]) -> int:
-    """Return the byte offset of the Gaussians of a section."""
-    offset: int = section["start"] + 4 * section["partial"] + section["center_bytes"] * section["buckets"]
-    return offset
 
 
 def _row(level: int, degree: int) -> np.dtype:
@@ -186,7 +182,7 @@ def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     for section in header.sections:
         buckets = _buckets(file, section) if header.level and section["count"] else None
         kind, steps = _row(header.level, section["degree"]), section["steps"] or _STEPS
-        for part, rows in row_blocks(file, kind, _data_offset(section), section["count"]):
+        for part, rows in row_blocks(file, kind, section["data"], section["count"]):
             block = slice(first + part.start, first + part.stop)
             positions = rows["position"].astype(np.float64)
             if buckets is not None:
