@@ -31,11 +31,6 @@ def is_checkpoint(head: bytes) -> bool:
     return (head.startswith(b"PK") and _CHECKPOINT in head[:200]) or head.startswith(_PICKLE)
 
 
-def is_usdz(head: bytes) -> bool:
-    """Return whether the first bytes of a file are those of a USDZ archive, whose first file is a USD layer."""
-    return head.startswith(b"PK") and b".usd" in head[:200]
-
-
 def _is_html(head: bytes) -> bool:
     return head[:20].lower().startswith((b"<!doctype html", b"<html"))
 
@@ -103,7 +98,7 @@ SCENES = (
     Kind(f"a scene of XGRIDS. {converted('scene.lcc')}", _begins(b"{", holding=b'"totalsplats"'), (".lcc", ".lcc2")),
     Kind(
         "OpenUSD, which is written but not read. Give the scene that it was made of, or export it as PLY.",
-        lambda head: head.startswith((b"PXR-USDC", b"#usda")) or is_usdz(head),
+        lambda head: head.startswith((b"PXR-USDC", b"#usda")) or (head.startswith(b"PK") and b".usd" in head[:200]),
     ),
     Kind(
         "an archive of NumPy arrays, such as those of gsplat, not a scene. Write a PLY of it with "

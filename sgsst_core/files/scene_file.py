@@ -238,14 +238,14 @@ def losses(scene: Scene, format: SceneFormat) -> tuple[str, ...]:
     """Return notes that count the Gaussians that a format cannot hold: values that it clips, or rounds too much."""
     arrays, notes = arrays_of(scene), []
     scales = arrays["scales"].max(axis=1)  # a Gaussian that is thin in one axis looks the same
-    for name, (low, high) in format.limits.ranges.items():
+    for name, (low, high) in format.ranges.items():
         values = (scales if name == "scales" else arrays[name]).reshape(len(scene), -1)
         clipped = int(((values < low) | (values > high)).any(axis=1).sum())
         if clipped:
             title = f"{_TITLES[name]} outside {low:.3g} to {high:.3g}, which {format.title} clips"
             notes.append(f"{clipped:,} of {len(scene):,} Gaussians have {title}")
-    if format.limits.step is not None:
-        coarse = int((format.limits.step(arrays["means"]) > _COARSE * np.exp(scales.astype(np.float64))).sum())
+    if format.step is not None:
+        coarse = int((format.step(arrays["means"]) > _COARSE * np.exp(scales.astype(np.float64))).sum())
         if coarse:
             moved = f"{format.title} moves {coarse:,} of {len(scene):,} Gaussians"
             notes.append(f"{moved} by up to more than their size, because others are far away")

@@ -38,7 +38,6 @@ from sgsst_core.files.formats.scene_format import (
     Arrays,
     FileStart,
     Frame,
-    Limits,
     OpenScene,
     RenderTag,
     SceneFormat,
@@ -478,5 +477,5 @@ def _matches(start: FileStart) -> bool:
 GLB = SceneFormat(
     *("glb", "GLB", 240, _matches, _read_header, _read, _write),
     media_type="model/gltf-binary",
-    limits=Limits({"scales": _LOG_SCALES}),
+    ranges={"scales": _LOG_SCALES},
 )

@@ -41,7 +41,6 @@ from sgsst_core.files.formats.scene_format import (
     STORED_COEFFICIENTS,
     Arrays,
     FileStart,
-    Limits,
     OpenScene,
     RenderTag,
     SceneFormat,
@@ -685,5 +684,6 @@ def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
 
 COMPRESSED_PLY = SceneFormat(
     *("compressed.ply", "compressed PLY", 61, _matches_compressed, _read_compressed_header, _read, _write),
-    limits=Limits({"scales": (-_LARGEST_SCALE, _LARGEST_SCALE), "sh_rest": (-4.0, 4.0)}, _step),
+    ranges={"scales": (-_LARGEST_SCALE, _LARGEST_SCALE), "sh_rest": (-4.0, 4.0)},
+    step=_step,
 )

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,23 +108,6 @@ class SceneHeader:
     tag: RenderTag = field(default=UNTAGGED, kw_only=True)
 
 
-class Limits(NamedTuple):
-    """Range and precision of a format's values.
-
-    Attributes:
-        ranges: Lowest and highest value by the name of the array. That of "scales" holds for the largest of each
-            Gaussian.
-        step: Distance between positions that can be stored, for positions [n, 3]: [n], or the same for all. None if
-            positions are floats.
-    """
-
-    ranges: Mapping[str, tuple[float, float]] = {}
-    step: Callable[[NDArray[np.float32]], NDArray[np.float64]] | None = None
-
-
-_UNLIMITED = Limits()
-
-
 @dataclass(frozen=True)
 class SceneFormat:
     """Scene format.
@@ -145,7 +128,10 @@ class SceneFormat:
             written back.
         write: Writer of a scene's arrays and its render mode, if the format can state one. It raises an OutputError
             without path if it cannot represent the arrays. None if the format is only read.
-        limits: Range and precision of its values.
+        ranges: Lowest and highest value by the name of the array. That of "scales" holds for the largest of each
+            Gaussian.
+        step: Distance between positions that can be stored, for positions [n, 3]: [n], or the same for all. None if
+            positions are floats.
         has_axes: Whether the writer takes axes as a fourth argument.
     """
 
@@ -157,7 +143,8 @@ class SceneFormat:
     read: Callable[[OpenScene, SceneHeader, Arrays], SceneHeader | None] | None = None
     write: Callable[..., None] | None = None
     media_type: str = "application/octet-stream"
-    limits: Limits = _UNLIMITED
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    step: Callable[[NDArray[np.float32]], NDArray[np.float64]] | None = None
     has_axes: bool = False
 
     @property

@@ -46,7 +46,6 @@ from sgsst_core.files.formats.scene_format import (
     WRONG_JSON,
     Arrays,
     FileStart,
-    Limits,
     OpenScene,
     SceneFormat,
     SceneHeader,
@@ -694,7 +693,7 @@ def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.max((high - low) / 65535 * (1 + np.abs(means)), axis=1)  # type: ignore[no-any-return]
 
 
-SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write, limits=Limits(step=_step))
+SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write, step=_step)
 
 
 #: Name of the index in a folder or an archive.

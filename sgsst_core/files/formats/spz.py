@@ -40,7 +40,6 @@ from sgsst_core.files.formats.scene_format import (
     UNTAGGED,
     Arrays,
     FileStart,
-    Limits,
     OpenScene,
     RenderTag,
     SceneFormat,
@@ -552,11 +551,12 @@ def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-_LIMITS = Limits(
-    {"scales": (_SCALES[0], _SCALES[-1]), "sh_dc": (_COLORS[0], _COLORS[-1]), "sh_rest": (-1.0, 1.0)},
-    lambda means: np.ldexp(1.0, -_fractional_bits(means)),
+SPZ = SceneFormat(
+    *("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write),
+    ranges={"scales": (_SCALES[0], _SCALES[-1]), "sh_dc": (_COLORS[0], _COLORS[-1]), "sh_rest": (-1.0, 1.0)},
+    step=lambda means: np.ldexp(1.0, -_fractional_bits(means)),
+    has_axes=True,
 )
-SPZ = SceneFormat("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write, limits=_LIMITS, has_axes=True)
-SPZ_3 = SceneFormat(
-    *("v3.spz", "SPZ 3", 25, _is_old_version, _old_header, _read, _write_version_3), limits=_LIMITS, has_axes=True
+SPZ_3 = replace(
+    SPZ, name="v3.spz", title="SPZ 3", matches=_is_old_version, read_header=_old_header, write=_write_version_3
 )
