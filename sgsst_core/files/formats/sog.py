@@ -706,30 +706,16 @@ _PART = re.compile(rf"((?:[\w-][\w.-]{{0,99}}/){{1,4}}){re.escape(META_NAME)}")
 
 
 @dataclass(frozen=True)
-class _Part:
-    """SOG scene with the Gaussians of one level, or of the environment, whose level is None."""
-
-    folder: str
-    level: int | None
-    header: SogHeader
-
-
-@dataclass(frozen=True)
 class StreamedHeader(SceneHeader):
     """Header of a streamed SOG.
 
     Attributes:
-        parts: All parts, those of the scene first.
-        ends: End of the Gaussians of each part of the scene among those of the scene, after a 0.
+        parts: Headers of all parts by folder, those of the scene first: of its finest level, and of the environment.
+        rows: Slices of the Gaussians of each part of the scene among those of the scene.
     """
 
-    parts: tuple[_Part, ...]
-    ends: tuple[int, ...]
-
-    @property
-    def rows(self) -> list[tuple[_Part, slice]]:
-        """Return the parts of the scene with the slices of their Gaussians."""
-        return [(part, slice(*span)) for part, span in zip(self.parts, pairwise(self.ends), strict=False)]
+    parts: dict[str, SogHeader]
+    rows: dict[str, slice]
 
 
 @contextmanager
@@ -764,23 +750,23 @@ def _read_streamed_header(start: FileStart) -> StreamedHeader:
                 f"{start.path}: {INDEX_NAME} is not that of a streamed SOG ({repr(error)[:200]}). Export the scene "
                 "again."
             ) from error
-        parts = [_part(files, folder, *entry) for folder, entry in folders.items()]
-    levels = sorted({part.level for part in parts if part.level is not None})
+        parts = {folder: _part(files, folder, *entry) for folder, entry in folders.items()}
+    levels = sorted({level for level, _ in folders.values() if level is not None})
     if not levels:
         raise SceneError(f"{start.path}: {INDEX_NAME} refers to no Gaussians. Export the scene again.")
-    scene = [part for part in parts if part.level in (levels[0], None)]
-    ends = (0, *accumulate(part.header.count for part in scene))
+    scene = {folder: parts[folder] for folder, (level, _) in folders.items() if level in (levels[0], None)}
+    ends = [0, *accumulate(part.count for part in scene.values())]
     if files.archive and ends[-1] > GAUSSIANS_PER_BYTE * start.size:
         raise SceneError(f"{start.path}: declares {ends[-1]} Gaussians, more than it can hold. Export the scene again.")
     notes = (f"the finest of {len(levels)} levels of detail is read; a .zip of it has all of them, with its colors",)
     return StreamedHeader(
         STREAMED_SOG,
         ends[-1],
-        max(part.header.coefficients for part in scene),
-        (*scene, *(part for part in parts if part.level not in (levels[0], None))),
-        ends,
+        max(part.coefficients for part in scene.values()),
+        scene | parts,
+        {folder: slice(*span) for folder, span in zip(scene, pairwise(ends), strict=True)},
         notes=files.surplus + (notes if len(levels) > 1 else ()),
-        tag=scene[0].header.tag,
+        tag=next(iter(scene.values())).tag,
     )
 
 
@@ -824,8 +810,8 @@ def _folder(name: str) -> str:
     return match[1]
 
 
-def _part(files: SogFiles, folder: str, level: int | None, ranges: list[tuple[int, int]]) -> _Part:
-    """Return a part, after checking that the tree refers to each of its Gaussians once."""
+def _part(files: SogFiles, folder: str, level: int | None, ranges: list[tuple[int, int]]) -> SogHeader:
+    """Return the header of a part, after checking that the tree refers to each of its Gaussians once."""
     header = sog_header(files.part(folder))
     end = 0
     for offset, count in sorted(ranges):
@@ -835,18 +821,19 @@ def _part(files: SogFiles, folder: str, level: int | None, ranges: list[tuple[in
             f"{files.path}: {folder}{META_NAME} has {header.count} Gaussians, but {INDEX_NAME} does not refer to each "
             "once. Export the scene again."
         )
-    return _Part(folder, level, header)
+    return header
 
 
 def _read_streamed(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
     assert isinstance(header, StreamedHeader)
     with _opened_levels(file.path) as (files, _):
-        for part, rows in header.rows:
+        for folder, rows in header.rows.items():
+            part = header.parts[folder]
             arrays = {name: array[rows] for name, array in into.items()}
-            arrays["sh_rest"][:, part.header.coefficients :] = 0
-            arrays["sh_rest"] = arrays["sh_rest"][:, : part.header.coefficients]
-            read_sog(files.part(part.folder), part.header, arrays)
-    notes = (note for part, _ in header.rows for note in part.header.notes)
+            arrays["sh_rest"][:, part.coefficients :] = 0
+            arrays["sh_rest"] = arrays["sh_rest"][:, : part.coefficients]
+            read_sog(files.part(folder), part, arrays)
+    notes = (note for folder in header.rows for note in header.parts[folder].notes)
     return replace(header, notes=tuple(dict.fromkeys((*header.notes, *notes))))
 
 
@@ -858,10 +845,10 @@ def pack(index: Path, target: Path) -> None:
     """
     header = _read_streamed_header(FileStart(index, b"", index.stat().st_size))
     with _opened_levels(index) as (files, text), zipfile.ZipFile(target, "w") as archive:
-        for part in header.parts:
-            unchanged = np.zeros((part.header.count, 3), np.float32)
-            for name, data in recolored(files.part(part.folder), part.header, unchanged).items():
-                archive.writestr(zipfile.ZipInfo(part.folder + name), data)
+        for folder, part in header.parts.items():
+            unchanged = np.zeros((part.count, 3), np.float32)
+            for name, data in recolored(files.part(folder), part, unchanged).items():
+                archive.writestr(zipfile.ZipInfo(folder + name), data)
         archive.writestr(zipfile.ZipInfo(INDEX_NAME), text)
 
 
@@ -890,27 +877,25 @@ def write_recolored(
 
     with _opened_levels(original) as (files, text):
         own: Arrays = {name: np.empty((header.count, 3), np.float32) for name in ("means", "sh_dc")}
-        for part, rows in header.rows:
-            read_positions(files.part(part.folder), part.header, own["means"][rows])
-            pixels = _pixels(files.part(part.folder), part.header, "sh0")
-            own["sh_dc"][rows] = _looked_up(part.header.colors, pixels)
+        for folder, rows in header.rows.items():
+            part = header.parts[folder]
+            read_positions(files.part(folder), part, own["means"][rows])
+            own["sh_dc"][rows] = _looked_up(part.colors, _pixels(files.part(folder), part, "sh0"))
         if not np.array_equal(means, own["means"]):
             raise OutputError(
                 f"The scene's Gaussians are not those of the finest level of {original}, in the same order. Give that "
                 "level with other colors, as a PLY, without --refine."
             )
         change, tree = colors - own["sh_dc"], cKDTree(means)
-        rows_of = {part.folder: rows for part, rows in header.rows}
-        for part in header.parts:
-            own_files = files.part(part.folder)
-            if part.folder in rows_of:
-                changed = change[rows_of[part.folder]]
+        for folder, part in header.parts.items():
+            if folder in header.rows:
+                changed = change[header.rows[folder]]
             else:
-                positions = np.empty((part.header.count, 3), np.float32)
-                read_positions(own_files, part.header, positions)
+                positions = np.empty((part.count, 3), np.float32)
+                read_positions(files.part(folder), part, positions)
                 changed = change[tree.query(np.nan_to_num(positions))[1]]
-            for name, data in recolored(own_files, part.header, changed).items():
-                archive.writestr(zipfile.ZipInfo(part.folder + name), data)
+            for name, data in recolored(files.part(folder), part, changed).items():
+                archive.writestr(zipfile.ZipInfo(folder + name), data)
         archive.writestr(zipfile.ZipInfo(INDEX_NAME), text)
 
 
