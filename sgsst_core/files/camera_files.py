@@ -262,10 +262,10 @@ def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:
                     "size. Export the model again."
                 )
             cameras.append(_panorama(where, image.name, size, matrix))
-            continue
-        of_photos = _colmap_lens(where, lens)
-        pinhole = (of_photos.fx, of_photos.fy, of_photos.cx, of_photos.cy)
-        cameras.append([_camera(where, image.name, size, pinhole, matrix, of_photos)])
+        else:
+            of_photos = _colmap_lens(where, lens)
+            pinhole = (of_photos.fx, of_photos.fy, of_photos.cx, of_photos.cy)
+            cameras.append([_camera(where, image.name, size, pinhole, matrix, of_photos)])
     if not cameras:
         reasons = "".join(f" {note}." for note in notes)
         raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.{reasons}")

@@ -25,7 +25,7 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import HEAD_BYTES, RESULT_FORMATS, RESULT_SUFFIXES, format_of_name
 from sgsst_core.files.formats.ply import PLY
-from sgsst_core.files.formats.scene_format import OPACITY_LOGITS
+from sgsst_core.files.formats.scene_format import OPACITY_LOGITS, read_bytes
 from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.scene_file import SceneFile, file_stamp, losses, read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
@@ -182,9 +182,8 @@ class TrainerCheckpoint:
 def is_trainer_checkpoint(path: Path) -> bool:
     """Return whether a file is a checkpoint in a ZIP archive, as PyTorch has written them since version 1.6."""
     try:
-        with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-    except OSError:
+        head = read_bytes(path, 0, HEAD_BYTES)
+    except SceneError:
         return False
     return head.startswith(b"PK") and is_checkpoint(head)
 

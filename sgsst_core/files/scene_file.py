@@ -320,12 +320,11 @@ def encode_scene(
         OutputError: If the format cannot represent the scene.
     """
     assert format.write is not None
-    if format is not PLY:
-        scene = scene.without_zero_bands()
     try:
         if format is PLY:
             write_ply(output, arrays_of(scene), scene.rendering, COEFFICIENTS[3] if pad_sh else 0)
         else:
+            scene = scene.without_zero_bands()
             format.write(output, arrays_of(scene), scene.rendering, *([axes] if format.has_axes else []))
     except OutputError as error:
         raise OutputError(f"{target}: {error}") from error

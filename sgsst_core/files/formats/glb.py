@@ -272,35 +272,34 @@ def _part(
             raise ValueError(f"SPZ of {header.count} Gaussians in place of {count}")
         return GlbPart(count, {}, [], frame, tag if tag.reason else header.tag, linear, header)
 
-    def accessor(name: str, kind: str) -> Accessor:
-        if name not in attributes:
-            raise SceneError(f"{path}: its Gaussians have no attribute {name}. Export it again.")
-        return _accessor(document, attributes[name], kind, count, data)
-
     present = sum(name in attributes for name in _HARMONICS)
     coefficients = min(number for number in COEFFICIENTS.values() if number >= present)
     return GlbPart(
         count,
-        {name: accessor(*attribute) for name, attribute in _ATTRIBUTES.items()},
-        [accessor(name, "VEC3") for name in _HARMONICS[:coefficients]],
+        {name: _accessor(document, attributes, *each, count, data) for name, each in _ATTRIBUTES.items()},
+        [_accessor(document, attributes, name, "VEC3", count, data) for name in _HARMONICS[:coefficients]],
         frame,
         tag,
         linear,
     )
 
 
-def _accessor(document: dict[str, Any], index: int, shape: str, count: int, data: range) -> Accessor:
-    """Check that the values of an accessor lie in the binary data."""
-    entry = document["accessors"][index]
+def _accessor(
+    document: dict[str, Any], attributes: dict[str, int], name: str, shape: str, count: int, data: range
+) -> Accessor:
+    """Check that the values of an attribute lie in the binary data."""
+    if name not in attributes:
+        raise ValueError(f"the Gaussians have no attribute {name}")
+    entry = document["accessors"][attributes[name]]
     if entry["type"] != shape or entry["count"] != count or "sparse" in entry:
-        raise ValueError(f"accessor {index}: {entry}")
+        raise ValueError(f"accessor of {name}: {entry}")
     start, size = _view(document, entry["bufferView"], data)
     code = _TYPES[entry["componentType"]]
     kind = np.dtype((code, (_COMPONENTS[shape],)))
     stride = whole_number("stride", document["bufferViews"][entry["bufferView"]].get("byteStride", kind.itemsize))
     first = whole_number("byteOffset", entry.get("byteOffset", 0))
     if first + (count - 1) * stride + kind.itemsize > size or not kind.itemsize <= stride <= _MAX_STRIDE:
-        raise ValueError(f"accessor {index}: {count} values are more than its {size} bytes can hold")
+        raise ValueError(f"accessor of {name}: {count} values are more than its {size} bytes can hold")
     largest = _LARGEST.get(code) if entry.get("normalized", False) else None
     return Accessor(start + first, stride, kind, largest)
 
