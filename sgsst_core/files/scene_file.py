@@ -417,6 +417,7 @@ FLAT = -40.0
 MAX_ROUNDED = 0.1
 
 
+@np.errstate(over="ignore")
 def about_rounded_positions(means: NDArray[Any], scales: NDArray[Any]) -> tuple[str, ...]:
     """Return a note if positions in double precision are too large for float32.
 
@@ -424,9 +425,8 @@ def about_rounded_positions(means: NDArray[Any], scales: NDArray[Any]) -> tuple[
         means: Positions [N, 3] float32.
         scales: Log scales [N, 3].
     """
-    with np.errstate(over="ignore"):
-        error = 0.5 * float(np.spacing(np.nanmedian(np.abs(means), axis=0)).max())
-        fraction = error / max(float(np.exp(np.nanmedian(scales))), 1e-30)
+    error = 0.5 * float(np.spacing(np.nanmedian(np.abs(means), axis=0)).max())
+    fraction = error / max(float(np.exp(np.nanmedian(scales))), 1e-30)
     if not fraction > MAX_ROUNDED:
         return ()
     return (
@@ -542,6 +542,7 @@ class SceneColumns:
         return retained
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # invalid values are reported later
 def apply_filter(scales: NDArray[np.float32], opacities: NDArray[np.float32], deviations: NDArray[Any]) -> None:
     """Convolve Gaussians with the 3D filters of Mip-Splatting, in place.
 
@@ -556,12 +557,11 @@ def apply_filter(scales: NDArray[np.float32], opacities: NDArray[np.float32], de
         deviations: [n], deviation f of each filter, in world units; 0 leaves the Gaussian unchanged.
     """
     before, logits = scales.astype(np.float64), opacities.astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # invalid values are reported later
-        filters = 2 * np.log(np.abs(deviations.astype(np.float64)))
-        after = np.logaddexp(2 * before, filters[:, None]) / 2
-        ratio = (before - after).sum(axis=1)
-        log_opacity = ratio - np.logaddexp(0, -logits)
-        filtered = log_opacity - np.log(-np.expm1(log_opacity))
+    filters = 2 * np.log(np.abs(deviations.astype(np.float64)))
+    after = np.logaddexp(2 * before, filters[:, None]) / 2
+    ratio = (before - after).sum(axis=1)
+    log_opacity = ratio - np.logaddexp(0, -logits)
+    filtered = log_opacity - np.log(-np.expm1(log_opacity))
     scales[:] = after
     opacities[:] = np.where(ratio < 0, filtered, logits)
 

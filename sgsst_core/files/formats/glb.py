@@ -346,6 +346,7 @@ def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     return matrix
 
 
+@np.errstate(over="ignore", invalid="ignore")  # invalid values are reported later
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     """Fill the arrays of a scene. Opacities of 0 and 1 and standard deviations of 0 become infinite."""
     assert isinstance(header, GlbHeader)
@@ -360,32 +361,31 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     for part in header.parts:
         arrays = {name: array[first : first + part.count] for name, array in into.items()}
         first += part.count
-        with np.errstate(over="ignore", invalid="ignore"):  # invalid values are reported later
-            for name, convert in converters.items() if not part.spz else ():
-                for block, values in _values(file, part.accessors[name], part.count):
-                    arrays[name][block] = convert(values)
-            for index, accessor in enumerate(part.harmonics):
-                for block, values in _values(file, accessor, part.count):
-                    arrays["sh_rest"][block, index] = values
-            arrays["sh_rest"][:, part.coefficients :] = 0
-            if part.spz:
-                within = {**arrays, "sh_rest": arrays["sh_rest"][:, : part.coefficients]}
-                assert SPZ_3.read is not None
-                SPZ_3.read(file, part.spz, within)
-            part.frame.apply(arrays)
-            if part.linear:
-                _convert_linear(arrays)
+        for name, convert in converters.items() if not part.spz else ():
+            for block, values in _values(file, part.accessors[name], part.count):
+                arrays[name][block] = convert(values)
+        for index, accessor in enumerate(part.harmonics):
+            for block, values in _values(file, accessor, part.count):
+                arrays["sh_rest"][block, index] = values
+        arrays["sh_rest"][:, part.coefficients :] = 0
+        if part.spz:
+            within = {**arrays, "sh_rest": arrays["sh_rest"][:, : part.coefficients]}
+            assert SPZ_3.read is not None
+            SPZ_3.read(file, part.spz, within)
+        part.frame.apply(arrays)
+        if part.linear:
+            _convert_linear(arrays)
 
 
+@np.errstate(invalid="ignore")
 def _convert_linear(arrays: Arrays) -> None:
     """Convert linear colors to sRGB in place (IEC 61966-2-1); harmonics by the slope at the color of degree 0."""
-    with np.errstate(invalid="ignore"):
-        colors = np.maximum(COLOR_OFFSET + SH_C0 * arrays["sh_dc"].astype(np.float64), 0)
-        dark, power = colors <= 0.0031308, np.maximum(colors, 0.0031308) ** (1 / 2.4)
-        encoded = np.where(dark, 12.92 * colors, 1.055 * power - 0.055)
-        slopes = np.where(dark, 12.92, 1.055 / 2.4 * power / np.maximum(colors, 0.0031308))
-        arrays["sh_dc"][:] = (encoded - COLOR_OFFSET) / SH_C0
-        arrays["sh_rest"] *= slopes[:, None].astype(np.float32)
+    colors = np.maximum(COLOR_OFFSET + SH_C0 * arrays["sh_dc"].astype(np.float64), 0)
+    dark, power = colors <= 0.0031308, np.maximum(colors, 0.0031308) ** (1 / 2.4)
+    encoded = np.where(dark, 12.92 * colors, 1.055 * power - 0.055)
+    slopes = np.where(dark, 12.92, 1.055 / 2.4 * power / np.maximum(colors, 0.0031308))
+    arrays["sh_dc"][:] = (encoded - COLOR_OFFSET) / SH_C0
+    arrays["sh_rest"] *= slopes[:, None].astype(np.float32)
 
 
 def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[slice, NDArray[np.float64]]]:

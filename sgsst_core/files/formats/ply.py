@@ -583,6 +583,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
     return replace(header, notes=(*header.notes, *notes))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # non-finite results are reported later
 def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
     position, rotation, scale, color = (rows[name].astype(np.uint32) for name in _PACKED)
     chunk = np.arange(len(rows)) // CHUNK_ROWS
@@ -593,15 +594,13 @@ def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
             np.stack([chunks[name].astype(np.float64) for name in side], axis=1)[chunk]
             for side in (names[:3], names[3:])
         )
-        with np.errstate(invalid="ignore", over="ignore"):  # non-finite results are reported later
-            return low * (1 - fraction) + high * fraction
+        return low * (1 - fraction) + high * fraction
 
-    with np.errstate(over="ignore"):
-        into["means"][:] = between("", "xyz", _three(position))
-        into["scales"][:] = between("scale_", "xyz", _three(scale))
-        fraction = np.stack([(color >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
-        colors = between("", "rgb", fraction) if "min_r" in (chunks.dtype.names or ()) else fraction
-        into["sh_dc"][:] = (colors - COLOR_OFFSET) / SH_C0
+    into["means"][:] = between("", "xyz", _three(position))
+    into["scales"][:] = between("scale_", "xyz", _three(scale))
+    fraction = np.stack([(color >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
+    colors = between("", "rgb", fraction) if "min_r" in (chunks.dtype.names or ()) else fraction
+    into["sh_dc"][:] = (colors - COLOR_OFFSET) / SH_C0
     into["opacities"][:] = OPACITY_LOGITS[color & 255]
     components = np.stack([(rotation >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023
     into["quats"][:] = with_largest(rotation >> 30, (components - 0.5) * np.sqrt(2))

@@ -336,6 +336,7 @@ _COLOR_ENDS = (0.1, 0.9)
 _HINT = "Export the scene again with logarithms of scales and logits of opacities, as 3DGS trainers write them."
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # invalid values are reported later
 def logarithms(path: Path, deviations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the logarithms of stored standard deviations; those of negative ones are NaN.
 
@@ -347,11 +348,11 @@ def logarithms(path: Path, deviations: NDArray[np.float64]) -> NDArray[np.float6
             f"{path}: its scales are negative, so they are logarithms, but the format stores standard deviations. "
             "Export the scene again."
         )
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # invalid values are reported later
-        result: NDArray[np.float64] = np.log(deviations)
+    result: NDArray[np.float64] = np.log(deviations)
     return result
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def logits(path: Path, opacities: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the logits of stored opacities; those outside 0..1 are NaN.
 
@@ -363,8 +364,7 @@ def logits(path: Path, opacities: NDArray[np.float64]) -> NDArray[np.float64]:
             f"{path}: its opacities are not in 0..1, so they are logits, but the format stores opacities. "
             "Export the scene again."
         )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        result: NDArray[np.float64] = np.log(opacities) - np.log1p(-opacities)
+    result: NDArray[np.float64] = np.log(opacities) - np.log1p(-opacities)
     return result
 
 
@@ -416,10 +416,10 @@ def check_units(path: Path, arrays: Arrays, flat: float, *, logits_stored: bool)
     return tuple(notes)
 
 
+@np.errstate(invalid="ignore")
 def _range(values: NDArray[np.float32]) -> tuple[float, float]:
     """Return the smallest and the largest of values that are not NaN."""
-    with np.errstate(invalid="ignore"):
-        return float(np.fmin.reduce(values, axis=None)), float(np.fmax.reduce(values, axis=None))
+    return float(np.fmin.reduce(values, axis=None)), float(np.fmax.reduce(values, axis=None))
 
 
 def _fits_as_deviations(means: NDArray[np.float32], scales: NDArray[np.float32]) -> bool:

@@ -523,11 +523,11 @@ def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
     return np.tile(values, (channels, 1))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # non-finite results are reported later
 def _steps(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
     """Return the values of each byte in version 1 by channel, [channels, 256]."""
     low, high = (json_numbers(entry[side], channels)[:, None] for side in ("mins", "maxs"))
-    with np.errstate(over="ignore", invalid="ignore"):  # non-finite results are reported later
-        return low + (high - low) * (np.arange(VALUES) / 255)
+    return low + (high - low) * (np.arange(VALUES) / 255)
 
 
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
@@ -536,6 +536,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
         read_sog(files, header, into)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # non-finite results are reported later
 def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> None:
     """Fill the arrays of a scene."""
     where = f"{files.path}: {files.folder}"
@@ -549,19 +550,17 @@ def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> None:
     colors = _pixels(files, header, "sh0")
     into["scales"][:] = _looked_up(header.scales, _pixels(files, header, "scales"))
     into["sh_dc"][:] = _looked_up(header.colors, colors)
-    with np.errstate(over="ignore", invalid="ignore"):
-        into["opacities"][:] = header.opacities.astype(np.float32)[colors[:, 3]]
-        if header.harmonics is not None:
-            stored = files.pixels(header.names["shN"][0], 1, _PALETTE_PIXELS)[..., :3]
-            entries = header.harmonics.astype(np.float32)[stored.reshape(-1, header.coefficients, 3)]
-            labels = _pixels(files, header, "shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
-            vectors = min(len(entries), header.vectors or len(entries))
-            if labels.max() >= vectors:
-                raise SceneError(
-                    f"{where}{header.names['shN'][1]} refers to vector {labels.max()} of {vectors}. Export the scene "
-                    "again."
-                )
-            into["sh_rest"][:] = entries[labels]
+    into["opacities"][:] = header.opacities.astype(np.float32)[colors[:, 3]]
+    if header.harmonics is not None:
+        stored = files.pixels(header.names["shN"][0], 1, _PALETTE_PIXELS)[..., :3]
+        entries = header.harmonics.astype(np.float32)[stored.reshape(-1, header.coefficients, 3)]
+        labels = _pixels(files, header, "shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
+        vectors = min(len(entries), header.vectors or len(entries))
+        if labels.max() >= vectors:
+            raise SceneError(
+                f"{where}{header.names['shN'][1]} refers to vector {labels.max()} of {vectors}. Export the scene again."
+            )
+        into["sh_rest"][:] = entries[labels]
 
 
 def _pixels(files: SogFiles, header: SogHeader, name: str, index: int = 0) -> NDArray[np.uint8]:
@@ -569,20 +568,20 @@ def _pixels(files: SogFiles, header: SogHeader, name: str, index: int = 0) -> ND
     return files.pixels(header.names[name][index], header.count).reshape(-1, 4)[: header.count]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # non-finite results are reported later
 def read_positions(files: SogFiles, header: SogHeader, into: NDArray[np.float32]) -> None:
     """Fill an array [n, 3] with the positions of a scene."""
     low, high = (_pixels(files, header, "means", index) for index in (0, 1))
     for block in blocks(header.count):
         steps = (low[block, :3] | high[block, :3].astype(np.uint16) << 8) / 65535
         values = header.bounds[0] + (header.bounds[1] - header.bounds[0]) * steps
-        with np.errstate(over="ignore", invalid="ignore"):  # non-finite results are reported later
-            into[block] = np.sign(values) * np.expm1(np.abs(values))
+        into[block] = np.sign(values) * np.expm1(np.abs(values))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # non-finite results are reported later
 def _looked_up(tables: NDArray[np.float64], pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the values of pixels [n, 4] in a table for each of three channels, [n, 3]."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.stack([tables[axis].astype(np.float32)[pixels[:, axis]] for axis in range(3)], axis=1)
+    return np.stack([tables[axis].astype(np.float32)[pixels[:, axis]] for axis in range(3)], axis=1)
 
 
 def recolored(files: SogFiles, header: SogHeader, change: NDArray[np.float32]) -> dict[str, bytes]:

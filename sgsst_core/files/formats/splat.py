@@ -174,6 +174,7 @@ def _row(level: int, degree: int) -> np.dtype:
     return np.dtype([*fields, ("harmonics", harmonic, 3 * COEFFICIENTS[degree])])
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # invalid values are reported later
 def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     """Fill the arrays of a scene. A standard deviation of 0 at level 0 becomes a log scale of minus infinity."""
     assert isinstance(header, KsplatHeader)
@@ -193,15 +194,14 @@ def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
                         f"{file.path}: holds Gaussians beyond its buckets: it is damaged. Export it again."
                     )
                 positions = (positions - steps) * (section["side"] / 2 / steps) + centers[owners]
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # invalid values are reported later
-                into["means"][block] = positions
-                scales = logarithms(file.path, rows["scale"].astype(np.float64))
-                into["scales"][block] = np.maximum(scales, _MIN_LOG_SCALE) if header.level else scales
-                into["quats"][block] = rows["rotation"]
-                into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
-                into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
-                harmonics = _harmonics(rows["harmonics"], header, COEFFICIENTS[section["degree"]])
-                into["sh_rest"][block, : harmonics.shape[1]] = harmonics
+            into["means"][block] = positions
+            scales = logarithms(file.path, rows["scale"].astype(np.float64))
+            into["scales"][block] = np.maximum(scales, _MIN_LOG_SCALE) if header.level else scales
+            into["quats"][block] = rows["rotation"]
+            into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
+            into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
+            harmonics = _harmonics(rows["harmonics"], header, COEFFICIENTS[section["degree"]])
+            into["sh_rest"][block, : harmonics.shape[1]] = harmonics
         first += section["count"]
 
 
