@@ -202,8 +202,10 @@ def read_scene(
         scene = scene.subset(torch.from_numpy(retained))
     if isinstance(header, PlySceneHeader) and header.sources:
         ply = None
-    fields = (header.format.name, sum(columns.clamped), notes, header.tag)
-    return SceneFile(path, scene, ply, retained, stamp, *fields, axes=header.axes)
+    return SceneFile(
+        *(path, scene, ply, retained, stamp, header.format.name, sum(columns.clamped), notes, header.tag),
+        axes=header.axes,
+    )
 
 
 def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
@@ -471,13 +473,13 @@ class SceneColumns:
         self.clamped: list[int] = []
         self._stored_flaws: list[NDArray[np.int64]] = []
 
+    @np.errstate(over="ignore")  # a double too large for float32 becomes infinite and is reported as such
     def take(self, start: int, rows: NDArray[Any]) -> None:
         """Copy a structured block of rows to the arrays from row `start` on. Thread-safe for different blocks."""
         block = slice(start, start + len(rows))
-        with np.errstate(over="ignore"):  # a double too large for float32 becomes infinite and is reported as such
-            for name, target in self._targets.items():
-                source = self._sources.get(name, name)
-                target[block] = (rows[source] / 255 - COLOR_OFFSET) / SH_C0 if source in RGB else rows[source]
+        for name, target in self._targets.items():
+            source = self._sources.get(name, name)
+            target[block] = (rows[source] / 255 - COLOR_OFFSET) / SH_C0 if source in RGB else rows[source]
         if FILTER_3D in (rows.dtype.names or ()):
             apply_filter(self.arrays["scales"][block], self.arrays["opacities"][block], rows[FILTER_3D])
         self.check(start, len(rows), rows)
@@ -515,8 +517,7 @@ class SceneColumns:
         Raises:
             SceneError: If invalid rows may not be dropped, or no valid rows remain.
         """
-        retained = self.retained
-        if retained.all():
+        if self.retained.all():
             return None
         counts = {name: (np.isnan(values).sum(), np.isinf(values).sum()) for name, values in self._targets.items()}
         if self._stored_flaws:
@@ -526,20 +527,20 @@ class SceneColumns:
             kinds = [f"{number} {what}" for number, what in zip(numbers, ("NaN", "infinite"), strict=True) if number]
             invalid += [f"{name} ({', '.join(kinds)})"] if kinds else []
         unrotated = np.flatnonzero((self.arrays["quats"] == 0).all(axis=1))
-        bad = int((~retained).sum())
+        bad = int((~self.retained).sum())
         flawed = [f"hold NaN or infinite values: {', '.join(invalid)}"] if invalid else []
         if len(unrotated):
             flawed += [
                 f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {unrotated[0]})"
             ]
-        summary = f"{path}: {bad} of {len(retained)} Gaussians {', or '.join(flawed)}"
+        summary = f"{path}: {bad} of {len(self.retained)} Gaussians {', or '.join(flawed)}"
         if surplus:
             raise SceneError(f"{summary}. Its rows are not as the header declares: {surplus[0]}.")
-        if bad == len(retained):
+        if bad == len(self.retained):
             raise SceneError(f"{summary}. No valid Gaussians remain. Train or export the scene again.")
         if not drop_invalid:
             raise SceneError(f"{summary}. Use --drop-invalid to drop these Gaussians.")
-        return retained
+        return self.retained
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # invalid values are reported later
@@ -588,6 +589,7 @@ def check_usd(out: Path) -> None:
     )
 
 
+@np.errstate(over="ignore")
 def write_usd(path: Path, scene: Scene) -> None:
     """Write a scene as a USD stage with y up, atomically. Standard deviations and opacities are stored as they are.
 
@@ -601,9 +603,8 @@ def write_usd(path: Path, scene: Scene) -> None:
     Frame.of(Y_UP).apply(arrays)
     quats = arrays["quats"].astype(np.float64)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    with np.errstate(over="ignore"):
-        scales = np.exp(arrays["scales"].astype(np.float64)).astype(np.float32)
-        opacities = (1 / (1 + np.exp(-arrays["opacities"].astype(np.float64)))).astype(np.float32)
+    scales = np.exp(arrays["scales"].astype(np.float64)).astype(np.float32)
+    opacities = (1 / (1 + np.exp(-arrays["opacities"].astype(np.float64)))).astype(np.float32)
     reach = _REACH * scales.max(axis=1, keepdims=True)
     bounds = np.stack([(arrays["means"] - reach).min(axis=0), (arrays["means"] + reach).max(axis=0)])
     harmonics = np.concatenate([arrays["sh_dc"][:, None], arrays["sh_rest"]], axis=1).reshape(-1, 3)

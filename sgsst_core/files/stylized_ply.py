@@ -348,8 +348,10 @@ def common_rests(scenes: Sequence[Scene]) -> list[Tensor]:
     """Return the coefficients above degree 0 of each scene, with zeros for bands that only others have."""
     rests = [held(scene.sh_rest) for scene in scenes]
     missing = [max(rest.shape[1] for rest in rests) - rest.shape[1] for rest in rests]
-    pad = torch.nn.functional.pad
-    return [pad(rest, (0, 0, 0, more)) if more else rest for rest, more in zip(rests, missing, strict=True)]
+    return [
+        torch.nn.functional.pad(rest, (0, 0, 0, more)) if more else rest
+        for rest, more in zip(rests, missing, strict=True)
+    ]
 
 
 def _weighted_sum(tensors: Sequence[Tensor], weights: Sequence[float]) -> Tensor:

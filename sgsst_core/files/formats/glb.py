@@ -415,10 +415,10 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
         output.write(np.ascontiguousarray(column).data)
 
 
+@np.errstate(over="ignore")
 def _columns(arrays: Arrays) -> list[tuple[str, NDArray[Any]]]:
     """Return the attributes of a scene in glTF's axes and their values, [n, components]."""
-    with np.errstate(over="ignore"):
-        opacities = np.clip(1 / (1 + np.exp(-arrays["opacities"].astype(np.float64))), 1e-37, _LARGEST_OPACITY)
+    opacities = np.clip(1 / (1 + np.exp(-arrays["opacities"].astype(np.float64))), 1e-37, _LARGEST_OPACITY)
     quats = np.roll(arrays["quats"].astype(np.float64), -1, axis=1)
     colors = np.clip(COLOR_OFFSET + SH_C0 * arrays["sh_dc"].astype(np.float64), 0, 1)
     linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # as glTF requires

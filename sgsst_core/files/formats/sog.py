@@ -503,8 +503,11 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
     tag = extras_tag({**extras, "model": model}, "meta.json")
     more = {name for name, value in meta.items() if isinstance(value, dict) and "files" in value} - names.keys()
     notes = (f"{', '.join(sorted(more))[:80]} of meta.json are unknown and left out",) if more else ()
-    bytes_of = (scales[:3], colors[:3], opacities, harmonics, vectors)
-    return SogHeader(SOG, count, coefficients, names, bounds, *bytes_of, notes=(*files.surplus, *notes), tag=tag)
+    return SogHeader(
+        *(SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics, vectors),
+        notes=(*files.surplus, *notes),
+        tag=tag,
+    )
 
 
 def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:

@@ -281,8 +281,11 @@ def _shared_fields(start: FileStart, head: bytes, least: int, versions: tuple[in
     drawn, extended = COEFFICIENTS[min(degree, 3)], bool(head[14] & _HAS_EXTENSIONS)
     unknown = head[14] & ~(_ANTIALIASED | _HAS_EXTENSIONS)
     notes = (f"the flags {unknown:#x} of the SPZ header are unknown and ignored",) if unknown else ()
-    fields = (count, drawn, start.size, start.offset, version, degree, fractional_bits, sections)
-    return SpzHeader(SPZ, *fields, extended=extended, notes=notes)
+    return SpzHeader(
+        *(SPZ, count, drawn, start.size, start.offset, version, degree, fractional_bits, sections),
+        extended=extended,
+        notes=notes,
+    )
 
 
 def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> SpzHeader:
