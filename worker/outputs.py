@@ -14,7 +14,6 @@ from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.formats.sog import STREAMED_SOG
 from worker.job import JobSpec, check_choice, check_steps
 
-
 #: Other suffixes of the same kind of file.
 _OTHER_SUFFIXES = {".jpg": ".jpeg", ".html": ".htm"}
 
