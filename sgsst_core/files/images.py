@@ -196,7 +196,7 @@ def _opened(path: Path, *, pixels: bool = True) -> Iterator[Image.Image]:
         with path.open("rb") as file:
             head = file.read(12)
         is_png = head.startswith(_PNG_SIGNATURE)
-        source, colors = _open_png(path, pixels=pixels) if is_png else (path, {})
+        source, colors = _open_png(path, pixels=pixels) if is_png else (path, dict[bytes, bytes]())
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
             opened = Image.open(source, formats=[*FORMATS, *_heif_format(path, head)])

@@ -128,7 +128,7 @@ def test_unpacked_streamed_sog_is_sent_as_an_archive(
             data = client.job(client.submit(scene, paths["style"], orbit=2).id).data
             assert data["name"] == "robot · style"
             assert "robot.zip" in json.dumps(data["inputs"])
-        with pytest.raises(RequestError, match=r"0_0/meta\.json is missing"):
+        with pytest.raises(RequestError, match=r"without 0_0/meta\.json"):
             client.submit(
                 archived(tmp_path / "a.zip", {"lod-meta.json": (folder / "lod-meta.json").read_bytes()}),
                 paths["style"],
