@@ -260,7 +260,8 @@ def draw_points(axes: Axes, x: Floats, values: Floats, **options: Any) -> None:
 def _mark_phases(axes: Axes, history: History, against: Against) -> None:
     """Label the first phase above the start of the axes and the second one above the end, with a line between them."""
     low, _ = history.limits[against]
-    for (title, part), side in zip(history.phases, ("left", "right"), strict=True):
+    sides: tuple[Literal["left", "right"], ...] = ("left", "right")
+    for (title, part), side in zip(history.phases, sides, strict=True):
         if part.start < part.stop:
             axes.set_title(title, loc=side)
             if part.start:
