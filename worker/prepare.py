@@ -96,7 +96,7 @@ def prepare(
 
     Args:
         resume: Choice of the checkpoint to resume from; None follows the request.
-        warn: Callback for checkpoints that cannot be used.
+        warn: Callback for the warning that the checkpoint is of another PyTorch version.
         show_planning: Callback for the progress of planning. It is not called if the checkpoint's plan
             is used.
         preview: Writer of previews, used on rank 0 of a new job; None to write none.

@@ -7,7 +7,7 @@ from sgsst_core.loss.terms import TERMS
 
 
 def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, Any]:
-    """Return a report of format version 2 with all fields set and the given number of steps."""
+    """Return a report with all fields set and the given number of steps."""
     history = [_record(step, "coarse" if step <= coarse else "sos", scales) for step in range(1, coarse + sos + 1)]
     seconds = history[-1]["seconds"] if history else 0.0
     before = {str(scale): _terms(1e6 / 4**scale) for scale in range(scales)}
@@ -78,11 +78,11 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
         "findings": [
             {
                 "subject": "scene",
-                "what": "needles",
+                "what": "opacity below 1/255",
                 "count": 1200,
                 "total": 5000,
                 "worst": "Gaussian 7",
-                "done": "drawn",
+                "done": "neither drawn nor optimized",
             },
             {"subject": "style", "what": "extreme aspect", "count": 1, "total": 1, "worst": "", "done": "used whole"},
         ],
