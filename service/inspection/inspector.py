@@ -72,7 +72,7 @@ class Lanes:
 #: Task of the inspecting process: validate a job's inputs, or plan the job as well.
 Work = Literal["validate", "plan"]
 #: Version of the validation; raising it invalidates stored findings.
-_VERSION = "7"
+_VERSION = "8"
 #: Number of requests of each kind at a time: checks of small and large jobs, so that small ones do not wait; plans;
 #: files derived from results; and videos. Two owners check at once: the files of one may take the full time limit.
 Kind = Literal["validate", "large", "plan", "file", "video"]
