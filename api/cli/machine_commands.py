@@ -28,7 +28,7 @@ weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_hel
 
 
 def doctor(as_json: JsonOption = False) -> None:
-    """Examine this machine: GPU, driver, precision, memory, weights, caches, and correct results.
+    """Examine this machine: GPU, precision, memory, weights, caches, and correct results.
 
     It takes half a minute, and another one the first time, when it compiles the kernels of jobs.
 

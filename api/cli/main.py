@@ -53,7 +53,7 @@ _SUMMARIES: dict[str, dict[str, str]] = {
         "study": "Blind comparisons of results by eye.",
     },
     "machine_commands": {
-        "doctor": "Examine this machine: GPU, driver, precision, memory, weights, caches, and correct results.",
+        "doctor": "Examine this machine: GPU, precision, memory, weights, caches, and correct results.",
         "weights": "Weights of the feature network.",
         "serve": "Run the service on this machine: HTTP API and dispatcher.",
         "fsck": "Check all files of the service against its database; the service may be running.",
