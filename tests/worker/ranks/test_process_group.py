@@ -370,9 +370,8 @@ def test_wait_for_another_rank_is_visible(tmp_path: Path) -> None:
 
 
 def rank_handle(waiting: float, stage: str | None = None, error: Exception | None = None) -> RankHandle:
-    status = RankStatus(
-        waiting=waiting, progress=Progress(stage=stage) if stage else None, outcome=error and Outcome(error=error)
-    )
+    outcome = None if error is None else Outcome(error=error)
+    status = RankStatus(waiting=waiting, progress=Progress(stage=stage) if stage else None, outcome=outcome)
     return RankHandle(None, None, status=status)
 
 
