@@ -556,6 +556,7 @@ class _ObjectWriter(PartWriter):
         size = self.offset - self.saved
         if not size:
             return self._upload.expires_at
+        self._file.truncate(size)  # a full disk may have cut off the last block
         location = f"{UPLOADS}/{self._upload.id}/{self.saved:016d}-{secrets.token_hex(6)}"
         self._objects.put(self._path, location)
         try:
