@@ -318,13 +318,15 @@ def _view(document: dict[str, Any], index: int, data: range) -> tuple[int, int]:
 
 @np.errstate(over="ignore", invalid="ignore")  # the transformation is checked
 def _node_matrix(
-    nodes: list[dict[str, Any]], parents: dict[int, int], index: int, below: NDArray[np.float64], depth: int = 0
+    nodes: list[dict[str, Any]], parents: dict[int, int], index: int, below: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return a transformation [4, 4] below a node after those of the node, and of the nodes above it."""
-    if depth == _MAX_DEPTH:
-        raise ValueError("the nodes are nested too deeply, or form a cycle")
-    matrix = _local_matrix(nodes[index]) @ below
-    return _node_matrix(nodes, parents, parents[index], matrix, depth + 1) if index in parents else matrix
+    for _ in range(_MAX_DEPTH):
+        below = _local_matrix(nodes[index]) @ below
+        if index not in parents:
+            return below
+        index = parents[index]
+    raise ValueError("the nodes are nested too deeply, or form a cycle")
 
 
 def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
