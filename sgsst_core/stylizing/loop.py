@@ -157,12 +157,16 @@ class _Pace:
     def ending_seconds(self) -> float:
         """Return the seconds from the last step to the last file, with the measurements."""
         work = self._stylizer.job.plan.work
-        measuring = work.measuring / work.sos * self.step_seconds() if work.sos else 0.0
+        measuring = work.measuring / work.sos * self.step_seconds(least=1) if work.sos else 0.0
         return measuring + self._slowdown() * ending_seconds(len(self._stylizer.job.scene))
 
     def _slowdown(self) -> float:
-        """Return how many times other processes lengthen the ending, which runs on one core: if this one gets less."""
-        if self._stylizer.job.network.device.type != "cpu":
+        """Return how many times other processes lengthen the ending, which runs on one core: if this one gets less.
+
+        1 before the job's pace is known: memory that is read anew in the first steps is no load.
+        """
+        job, steps = self._stylizer.job, len(self._stylizer.history) - self._first
+        if job.network.device.type != "cpu" or steps <= _FIRST_STEERED:
             return 1.0
         seconds, of_processor = (
             now - then for now, then in zip((time.perf_counter(), time.process_time()), self._started, strict=True)
@@ -206,7 +210,8 @@ def _steer(stylizer: Stylizer, callbacks: Callbacks, pace: _Pace, *, at_once: bo
 def _end_requested(stylizer: Stylizer, callbacks: Callbacks, first: int, pace: _Pace) -> Stopped | None:
     """Return the reason if the user or the time limit ends the run before the next step. Ranks may disagree.
 
-    A run that is to have a result makes a step at least, given the step that it starts at: resuming it gets further.
+    A run that is to have a result makes a step at least, given the step that it starts at: resuming it gets further. It
+    makes a second one, from which on its own pace is known, if there is any time left.
     """
     if callbacks.stop and callbacks.stop():
         return "interrupted"
@@ -216,8 +221,10 @@ def _end_requested(stylizer: Stylizer, callbacks: Callbacks, first: int, pace: _
         return "on-request"
     if callbacks.left is None:
         return None
-    coarse = stylizer.phase.scale is not None
-    return "within" if callbacks.left() <= pace.step_seconds(coarse=coarse, least=1) + pace.ending_seconds() else None
+    coarse, left = stylizer.phase.scale is not None, callbacks.left()
+    if stylizer.step == first + 1 and left > 0:
+        return None
+    return "within" if left <= pace.step_seconds(coarse=coarse, least=1) + pace.ending_seconds() else None
 
 
 def _enough(stylizer: Stylizer) -> Stopped | None:

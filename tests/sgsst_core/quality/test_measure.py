@@ -37,7 +37,8 @@ def measured(stylizer: Stylizer, stop: Any = None) -> list[int]:
     run(stylizer, Callbacks(stop=stop))
     assert stylizer.measured["novel_views"] is None, "nothing is measured between steps"
     Measurements(stylizer).at_the_end()
-    return [moment["step"] for moment in (stylizer.measured["novel_views"] or {"moments": []})["moments"]]
+    novel_views: dict[str, Any] = stylizer.measured["novel_views"] or {"moments": []}
+    return [moment["step"] for moment in novel_views["moments"]]
 
 
 def test_start_and_end_are_measured_without_effect(tiny_weights: BackboneWeights) -> None:
