@@ -316,6 +316,7 @@ def test_painting_of_a_region_is_not_one_of_the_job(
     appear(page.get_by_role("img", name="night.png"), page.locator(".thumb", has_text="for the left"))
     row = page.get_by_role("group", name="Region 1")
     assert row.get_by_label("Strength").input_value() == "light"
+    watched.settled()  # what is read later discards messages
     page.get_by_role("button", name="Start", exact=True).click()
     page.locator(".slot", has_text="Style").get_by_text("Choose a painting for the rest of the scene.").wait_for()
     page.get_by_label("Style", exact=True).first.set_input_files(files["style"])
