@@ -1,5 +1,5 @@
 // @ts-check
-/** What is painted on a view: a layer of strokes and images, and PNGs with a text (tEXt, iTXt) that states the view. */
+/** Painted views: a layer of strokes and images over a view, and PNGs whose text chunks (tEXt, iTXt) state the view. */
 import { h } from "./dom.js";
 
 /** @typedef {{image?: ImageBitmap, color?: string, size?: number, points?: number[][]}} Mark image of the layer's size, or stroke, with its width and points in pixels of the layer */

@@ -163,7 +163,7 @@ class _Pace:
     def _slowdown(self) -> float:
         """Return how many times other processes lengthen the ending, which runs on one core: if this one gets less.
 
-        1 before the job's pace is known: memory that is read anew in the first steps is no load.
+        The first steps are not judged: they also wait for memory that the system reads from disk.
         """
         job, steps = self._stylizer.job, len(self._stylizer.history) - self._first
         if job.network.device.type != "cpu" or steps <= _FIRST_STEERED:
