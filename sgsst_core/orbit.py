@@ -781,16 +781,15 @@ def find_upright_subject(
     """Return the subject of a scene and its up direction.
 
     Args:
-        requested: Up direction; None for that of the scene's file, or to estimate it.
+        requested: Up direction; None to estimate it.
         remaining: See `make_orbit`.
     """
     subject = whole = find_subject(scene)
     if remaining is not None:
         subject = find_subject(scene.subset(remaining))
-    stated = requested or scene.up
-    if stated is not None:
-        axis = torch.tensor(stated, dtype=torch.float64)
-        return subject, Up(axis / axis.norm().clamp_min(1e-300), "requested" if requested else "the file states it")
+    if requested is not None:
+        axis = torch.tensor(requested, dtype=torch.float64)
+        return subject, Up(axis / axis.norm().clamp_min(1e-300), "requested")
     up = find_up(subject)
     return subject, up if up.sure or subject is whole else find_up(whole)
 

@@ -31,7 +31,11 @@ from sgsst_core.files.library import TrainerCheckpoint, load_scene
 from sgsst_core.files.scene_file import (
     USD_SUFFIXES,
     SceneFile,
+    blend_scenes,
+    check_same_shape,
     check_usd,
+    common_rests,
+    encode_blend,
     encode_scene,
     losses,
     read_scene,
@@ -39,7 +43,6 @@ from sgsst_core.files.scene_file import (
     write_sog_folder,
     write_usd,
 )
-from sgsst_core.files.stylized_ply import blend_scenes, check_same_shape, common_rests, encode_blend
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit import ELEVATION, find_upright_subject, turntable
 from sgsst_core.progress import Decision, warnings_of

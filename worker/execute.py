@@ -14,8 +14,7 @@ import torch
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers, write_json
 from sgsst_core.files.formats.sog import STREAMED_SOG
-from sgsst_core.files.scene_file import write_levels, write_scene
-from sgsst_core.files.stylized_ply import write_colors, write_stylized
+from sgsst_core.files.scene_file import write_colors, write_levels, write_scene, write_stylized
 from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.progress import Progress
 from sgsst_core.quality.findings import findings_of

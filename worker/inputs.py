@@ -6,8 +6,7 @@ interpret the files in the same way.
 The lowest rank of a machine reads the scene and copies its arrays to an anonymous memory file (memfd). The other ranks
 open that file through the /proc entry of the reader and map it copy-on-write: ranks share the pages, but cannot change
 each other's data. The system frees the memory when the last process that uses it ends, so it cannot leak. Where there
-are no such files (Windows, macOS), every rank reads the scene. The spherical harmonics of a large scene stay in its
-file, which every rank opens.
+are no such files (Windows, macOS), every rank reads the scene.
 """
 
 from __future__ import annotations
@@ -36,8 +35,7 @@ from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.images import WHITE, Color, image_size, load_image
 from sgsst_core.files.photos import Photo, check_names, find_masks, load_photo
-from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_property, read_scene, stays_in_file
-from sgsst_core.files.stylized_ply import check_sh_attenuation
+from sgsst_core.files.scene_file import SceneFile, check_sh_attenuation, read_property, read_scene
 from sgsst_core.orbit import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.facts import check_scales
@@ -60,7 +58,6 @@ from sgsst_core.regions import (
 )
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import TENSORS, Scene
-from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
@@ -555,7 +552,6 @@ class _Shared:
     size: int
     layout: _Layout
     file: SceneFile  # with empty arrays
-    harmonics: tuple[Any, ...] | None  # arguments of StoredHarmonics, whose file must not be opened on other machines
 
 
 def read_shared_scene(
@@ -570,8 +566,7 @@ def read_shared_scene(
 
     Args:
         drop_invalid: Whether to drop invalid Gaussians; see `read_scene`.
-        growth: Factor by which refinement may increase the number of Gaussians. It scales the memory requirement, and
-            lowers the size up to which spherical harmonics are loaded into memory.
+        growth: Factor by which refinement may increase the number of Gaussians, and with it the memory requirement.
 
     Returns:
         The scene, and whether this rank read the file itself. Exactly one rank of each machine does.
@@ -584,7 +579,7 @@ def read_shared_scene(
     reader = homes.index(home())
     sharing = homes.count(home())
     together(collectives, lambda: _check_memory(path, collectives.rank, sharing, growth))
-    read = partial(read_scene, path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth), spz_axes=spz_axes)
+    read = partial(read_scene, path, drop_invalid=drop_invalid, spz_axes=spz_axes)
 
     def read_first() -> tuple[SceneFile | None, _Shared | None]:
         """Read the scene if this rank does so for its machine, and share it with the others there."""
@@ -608,16 +603,9 @@ def read_shared_scene(
     return own, collectives.rank == reader
 
 
-def _held_bytes(growth: float) -> int | None:
-    """Return the maximum bytes of spherical harmonics in memory for a scene that may grow; None for the default."""
-    return None if growth == 1 else int(HELD_BYTES / growth)
-
-
 def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
     """Copy a scene to a memory file; return the scene mapped from there, and its location."""
-    stored = file.scene.sh_rest if isinstance(file.scene.sh_rest, StoredHarmonics) else None
-    tensors = {name: getattr(file.scene, name) for name in TENSORS}
-    arrays: dict[str, NDArray[Any]] = {name: value.numpy() for name, value in tensors.items() if value is not stored}
+    arrays: dict[str, NDArray[Any]] = {name: getattr(file.scene, name).numpy() for name in TENSORS}
     if file.retained is not None:
         arrays["retained"] = file.retained
     layout: _Layout = {}
@@ -633,8 +621,7 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
             memory[offset : offset + data.nbytes] = data.data
     nothing: dict[str, Any] = dict.fromkeys(TENSORS, torch.empty(0))
     empty = replace(file.scene, **nothing)
-    in_file = None if stored is None else stored.arguments
-    shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, retained=None), in_file)
+    shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, retained=None))
     return _mapped(shared, f"/proc/self/fd/{descriptor}"), shared
 
 
@@ -648,8 +635,6 @@ def _mapped(shared: _Shared, path: str) -> SceneFile:
         arrays[name] = np.frombuffer(memory, kind, count, offset).reshape(shape) if count else np.empty(shape, kind)
     retained = arrays.pop("retained", None)
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    if shared.harmonics is not None:
-        tensors["sh_rest"] = StoredHarmonics(*shared.harmonics)
     return replace(shared.file, scene=replace(shared.file.scene, **tensors), retained=retained)
 
 
@@ -665,10 +650,8 @@ def _check_memory(path: Path, rank: int, sharing: int, growth: float) -> None:
         SceneTooLargeError: If the scene does not fit.
     """
     header = read_scene_header(path)
-    rest = 3 * header.coefficients
-    held = 0 if stays_in_file(header, _held_bytes(growth)) else rest  # in memory
-    sizes = header.count, header.count * 4 * (14 + held), header.count * 4 * (14 + rest)
-    count, scene_bytes, device_bytes = (int(size * growth) for size in sizes)
+    count = int(header.count * growth)
+    scene_bytes = int(header.count * 4 * (14 + 3 * header.coefficients) * growth)
     own = count * (OPTIMIZER_BYTES + VIEW_BYTES)
     each = scene_bytes + own  # every rank has its own copy of the Gaussians that its views show
     where = f"Rank {rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
@@ -681,7 +664,7 @@ def _check_memory(path: Path, rank: int, sharing: int, growth: float) -> None:
         )
     if torch.cuda.is_available():
         free, total = torch.cuda.mem_get_info()
-        needed = device_bytes + own
+        needed = scene_bytes + own
         if needed > free:
             raise SceneTooLargeError(
                 f"{where} {needed / 1e9:.2f} GB on its GPU ({torch.cuda.get_device_name()}, {total / 1e9:.1f} GB), but "

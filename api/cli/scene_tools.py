@@ -23,8 +23,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, write_json
 from sgsst_core.files.images import load_image, save_png
-from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
-from sgsst_core.files.stylized_ply import normalized, write_stylized
+from sgsst_core.files.scene_file import SceneFile, normalized, read_scene, write_scene, write_stylized
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.progress import Decision, warnings_of

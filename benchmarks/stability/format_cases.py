@@ -23,7 +23,6 @@ from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit import OrbitRequest, make_orbit
 from sgsst_core.scene.gaussians import TENSORS, Scene
-from sgsst_core.scene.stored_harmonics import held
 
 _GROUP: Group = "files and orbits"
 _AGAIN = "change when what was read is written and read again, in steps of the form"
@@ -68,7 +67,7 @@ def _far_and_near() -> Scene:
 
 def _saturated() -> Scene:
     scene = ordinary(30, seed=5, degree=1)
-    rest = held(scene.sh_rest)
+    rest = scene.sh_rest
     return replace(scene, sh_dc=scene.sh_dc * 1e3, sh_rest=rest * 1e3, opacities=scene.opacities * 40)
 
 
@@ -96,7 +95,7 @@ def _compressed(make: Callable[[], Scene], format: SceneFormat, full: bool) -> C
     steps |= {"sh_dc": 0.03, "opacities": math.inf, "quats": 0.02, "sh_rest": 1 / 16}
     error = 0.0
     for name, step in steps.items():
-        one, other = (_sorted(held(getattr(each, name)), each) for each in (reread, again))
+        one, other = (_sorted(getattr(each, name), each) for each in (reread, again))
         if math.isfinite(step) and one.numel():
             error = max(error, float((one.abs() - other.abs()).abs().max()) / step)
     return CaseResult(error, 2.0, f"{len(reread)} Gaussians; positions to {steps['means']:.2g}")
@@ -120,7 +119,7 @@ def _position_step(scene: Scene, format: SceneFormat) -> float:
 
 
 def _finite(scene: Scene) -> bool:
-    return all(bool(held(getattr(scene, name)).isfinite().all()) for name in TENSORS)
+    return all(bool(getattr(scene, name).isfinite().all()) for name in TENSORS)
 
 
 def _splat(make: Callable[[], Scene], full: bool) -> CaseResult:

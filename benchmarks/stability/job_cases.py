@@ -54,7 +54,6 @@ from sgsst_core.scales import scale_count
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import luminance
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.job import in_bfloat16
 from sgsst_core.stylizing.loop import run
@@ -418,7 +417,7 @@ def _opacities(*logits: float) -> Scene:
 
 def _with_harmonics(size: float, degree: int = 2) -> Scene:
     scene = crowd(degree=degree)
-    return replace(scene, sh_rest=held(scene.sh_rest) * size)
+    return replace(scene, sh_rest=scene.sh_rest * size)
 
 
 def _scan(**settings: object) -> Situation:

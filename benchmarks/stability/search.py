@@ -24,7 +24,6 @@ from benchmarks.stability.case import Case, CaseResult, Way, in_ways
 from benchmarks.stability.job_cases import MEASURE, STEPS, WAYS, Situation, crowd, even_network, strain, views
 from sgsst_core.errors import SgsstError
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import held
 
 #: Largest color coefficient; with a larger one, a job may report divergence.
 _MOST = 1e3
@@ -151,7 +150,7 @@ def _scene(rng: random.Random) -> Scene:
         changes["means"] = scene.means * torch.tensor([_size(rng, 1e-3, 10), _size(rng, 1e-3, 10), 1.0])
     changes["sh_dc"] = _colors(rng, scene.sh_dc)
     if scene.sh_degree:
-        changes["sh_rest"] = held(scene.sh_rest) * _size(rng, 1e-6, _MOST)
+        changes["sh_rest"] = scene.sh_rest * _size(rng, 1e-6, _MOST)
     return replace(scene, **changes)
 
 

@@ -27,12 +27,18 @@ from sgsst_core.files.formats import HEAD_BYTES, RESULT_FORMATS, RESULT_SUFFIXES
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import OPACITY_LOGITS, read_bytes
 from sgsst_core.files.formats.spz import SpzAxes
-from sgsst_core.files.scene_file import SceneFile, file_stamp, losses, read_scene, write_scene
-from sgsst_core.files.stylized_ply import write_stylized
+from sgsst_core.files.scene_file import (
+    SceneFile,
+    check_unchanged,
+    file_stamp,
+    losses,
+    read_scene,
+    write_scene,
+    write_stylized,
+)
 from sgsst_core.refine import Refinement, piece_counts
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene, attenuation_factor, checked_scene
-from sgsst_core.scene.stored_harmonics import changed
 
 #: Key of each field of `Scene` in a dictionary of splats.
 SPLAT_KEYS = {**{name: name for name in TENSORS}, "sh_dc": "sh0", "sh_rest": "shN"}
@@ -213,8 +219,7 @@ def write_checkpoint(checkpoint: TrainerCheckpoint, target: Path) -> None:
         OutputError: If the target cannot be written.
     """
     content = _load(checkpoint.path)
-    if file_stamp(checkpoint.path) != checkpoint.stamp:
-        raise changed(checkpoint.path)
+    check_unchanged(checkpoint.path, checkpoint.stamp)
     tensors, names = _splats_in(checkpoint.path, content)
     tensors.update({names[key]: value for key, value in checkpoint.splats.items()})
     with atomic_path(target) as temporary:

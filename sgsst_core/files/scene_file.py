@@ -1,6 +1,11 @@
-"""Reader and writer of scenes in any format, and writer of OpenUSD files.
+"""Reader and writers of scenes in any format, of stylized PLYs, of OpenUSD files and of colors; blends of scenes.
 
-PLYs may have any order and numeric type of the properties, and further ones; `stylized_ply` returns them unchanged.
+PLYs may have any order and numeric type of the properties, and further ones. Stylized PLYs keep all but the colors.
+
+With an SH attenuation, `f_rest_*` are multiplied by one factor in float32. The written coefficients equal those that
+the job optimized with, because `Scene.attenuated` multiplies the same float32 values by the same factor.
+
+Scenes that differ only in color are blended as weighted means of their spherical harmonics.
 """
 
 from __future__ import annotations
@@ -8,14 +13,17 @@ from __future__ import annotations
 import importlib.util
 import io
 import itertools
+import math
 import os
+import re
+import shutil
 import tempfile
 import zipfile
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +32,7 @@ from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
-from sgsst_core.errors import OutputError, SceneError, reading_scene
+from sgsst_core.errors import OutputError, SceneError, SettingsError, reading_scene
 from sgsst_core.files.atomic import DISK_FULL, atomic_path
 from sgsst_core.files.formats import read_scene_header, scene_path
 from sgsst_core.files.formats.ply import (
@@ -36,6 +44,7 @@ from sgsst_core.files.formats.ply import (
     PlySceneHeader,
     element_offsets,
     is_flat,
+    retagged,
     surplus,
     write_ply,
 )
@@ -46,34 +55,35 @@ from sgsst_core.files.formats.scene_format import (
     Y_UP,
     Arrays,
     Frame,
+    OpenScene,
     RenderTag,
     SceneFormat,
     SceneHeader,
     blocks,
+    changed,
     check_units,
+    read_rows,
 )
 from sgsst_core.files.formats.sog import INDEX_NAME, META_NAME, SOG, StreamedHeader, write_recolored
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.refine import Refinement, piece_counts
-from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.scene.gaussians import TENSORS, Scene, attenuation_factor
 from sgsst_core.scene.rendering import RenderMode
-from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
 
-#: Number of bytes per read. They stay in a core's L2 cache while they are split into columns.
-READ_BYTES = 1 << 20
-#: Maximum bytes of SH coefficients above degree 0 in memory: those of 1.4 million Gaussians of degree 3.
-HELD_BYTES = 1 << 28
+#: Rows of a PLY per block: a megabyte of a scene of SH degree 3 stays in a core's L2 cache while columns are copied.
+BLOCK_ROWS = 1 << 12
+_REST = re.compile(r"f_rest_\d+")
+#: Largest finite float16 value.
+_FLOAT16_MAX = 65504.0
 
 #: Standard 3DGS properties by their names in PLY files: field of `Scene`, and column of its tensor.
 _STANDARD = {name: (field, column) for field, names in PROPERTIES.items() for column, name in enumerate(names)} | {
     "opacity": ("opacities", 0)
 }
-#: Distance between positions, relative to a Gaussian's standard deviation, above which rounding moves it visibly.
-_COARSE = 4.0
 #: Names of arrays in notes.
 _TITLES = {"scales": "log scales", "sh_dc": "colors (f_dc)", "sh_rest": "spherical harmonics"}
 #: Properties that differ between the pieces of a split Gaussian.
-_SHAPE = (*PROPERTIES["means"], "opacity", *PROPERTIES["scales"], FILTER_3D)
+_SPLIT = (*PROPERTIES["means"], "opacity", *PROPERTIES["scales"], FILTER_3D)
 
 
 @dataclass(frozen=True)
@@ -117,7 +127,7 @@ class SceneFile:
         if self.copies is not None:
             raise SceneError(f"{self.path}: its Gaussians are split already. Save the result, and load it again.")
         kinds = self.header.vertex.kinds if self.header is not None else {}
-        integers = [name for name in _SHAPE if kinds.get(name, "f")[0] != "f"]
+        integers = [name for name in _SPLIT if kinds.get(name, "f")[0] != "f"]
         if integers:
             raise SceneError(
                 f"{self.path}: {', '.join(integers)} are stored as integers; smaller Gaussians need float or double. "
@@ -146,19 +156,13 @@ class SceneFile:
         return 0 if self.retained is None else int(len(self.retained) - self.retained.sum())
 
 
-def read_scene(
-    path: Path, *, drop_invalid: bool = False, held_bytes: int | None = None, spz_axes: SpzAxes = "auto"
-) -> SceneFile:
+def read_scene(path: Path, *, drop_invalid: bool = False, spz_axes: SpzAxes = "auto") -> SceneFile:
     """Read a 3DGS scene of SH degree 0 to 4, of which 0 to 3 are used. The format is detected from the file's content.
-
-    Scenes of other formats than PLY are decompressed into memory.
 
     Args:
         drop_invalid: Whether to drop Gaussians with NaN or infinite values, or with a quaternion of length 0, from the
             scene and the stylized file. If False, such a file is refused. Infinite opacities are clamped instead.
             Properties that 3DGS does not use are not checked.
-        held_bytes: Maximum bytes of SH coefficients above degree 0 in memory. If they take more, they stay in the file
-            (`StoredHarmonics`), provided that its layout allows this; see `stays_in_file`. None for `HELD_BYTES`.
         spz_axes: Axes of an SPZ file, "rub" or "rdf"; "auto" for those that the file states, else "rub".
 
     Raises:
@@ -170,60 +174,34 @@ def read_scene(
     if isinstance(header, SpzHeader):
         header = replace(header, requested=spz_axes)
     ply = header.ply if isinstance(header, PlySceneHeader) else None
-    offset = element_offsets(path, ply).get("vertex", 0) if ply else 0
-    file = RowFile(path)
-    stamp = file.stamp
-    stored = None
-    if isinstance(header, PlySceneHeader) and stays_in_file(header, held_bytes):
-        row = header.ply.vertex.dtype
-        column = row.fields["f_rest_0"][1] if row.fields else 0
-        stored = RowLayout(path, stamp, offset, header.count, row.itemsize, column, header.stored_coefficients)
-    columns = SceneColumns(header, stored)
+    stamp = file_stamp(path)
+    columns = SceneColumns(header)
     about_rest = surplus(path, ply) if ply else ()
-    if header.format.read is not None:
-        header = header.format.read(file, header, columns.arrays) or header
-        for block in blocks(header.count):
-            columns.check(block.start, block.stop - block.start)
-    elif ply is not None and ply.text:
-        columns.take(0, text_vertices(path, ply))
-    elif ply is not None:
-        _read_binary(file, ply, offset, columns)
-    file.check_unchanged(stamp)
-    retained = columns.valid_rows(path, drop_invalid, about_rest)
-    notes = (*header.notes, *about_rest)
-    notes += check_units(path, columns.arrays, FLAT, logits_stored=header.format is PLY)
-    if ply is not None and ply.has_double_positions:
-        notes += about_rounded_positions(columns.arrays["means"], columns.arrays["scales"])
+    with reading_scene(path), path.open("rb") as stream:
+        file = OpenScene(path, stream)
+        if header.format.read is not None:
+            header = header.format.read(file, header, columns.arrays) or header
+        elif ply is not None and ply.text:
+            columns.take(0, text_vertices(path, ply))
+        elif ply is not None:
+            # plyfile would map the file, which takes as long
+            kind, offset = ply.vertex.dtype, element_offsets(path, ply)["vertex"]
+            for start in range(0, header.count, BLOCK_ROWS):
+                rows = min(BLOCK_ROWS, header.count - start)
+                columns.take(start, read_rows(file, kind, offset + start * kind.itemsize, rows))
+    check_unchanged(path, stamp)
+    clamped, retained = columns.clamp_opacities(), columns.valid_rows(path, drop_invalid, about_rest)
+    check_units(path, columns.arrays, logits_stored=header.format is PLY)
     arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in columns.arrays.items()}
-    if stored:
-        arrays["sh_rest"] = StoredHarmonics(stored, coefficients=header.coefficients, file=file)
-    scene = Scene(**arrays, rendering=header.tag.rendering, up=header.up)
+    scene = Scene(**arrays, rendering=header.tag.rendering)
     if retained is not None:
         scene = scene.subset(torch.from_numpy(retained))
     if isinstance(header, PlySceneHeader) and header.sources:
         ply = None
+    notes = (*header.notes, *about_rest)
     return SceneFile(
-        *(path, scene, ply, retained, stamp, header.format.name, sum(columns.clamped), notes, header.tag),
-        axes=header.axes,
+        *(path, scene, ply, retained, stamp, header.format.name, clamped, notes, header.tag), axes=header.axes
     )
-
-
-def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
-    """Return whether a scene's SH coefficients above degree 0 stay in its file, rather than being loaded into memory.
-
-    They do if they would take more than `held_bytes` and the file has the layout of 3DGS trainers: binary
-    little-endian, float32 coefficients, in order.
-    """
-    if not isinstance(declared, PlySceneHeader) or not declared.coefficients or declared.sources:
-        return False
-    vertex = declared.ply.vertex
-    rest = [(f"f_rest_{i}", "f4") for i in range(3 * declared.stored_coefficients)]
-    first = [*vertex.kinds].index("f_rest_0")
-    plain = declared.ply.byte_order == "<" and [*vertex.kinds.items()][first : first + len(rest)] == rest
-    dtype = vertex.dtype
-    offset = dtype.fields["f_rest_0"][1] if dtype.fields else 0
-    limit = HELD_BYTES if held_bytes is None else held_bytes
-    return plain and dtype.itemsize % 4 == 0 and offset % 4 == 0 and 4 * len(rest) * vertex.count > limit
 
 
 def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY, axes: str = "rub") -> None:
@@ -246,11 +224,6 @@ def losses(scene: Scene, format: SceneFormat) -> tuple[str, ...]:
         if clipped:
             title = f"{_TITLES[name]} outside {low:.3g} to {high:.3g}, which {format.title} clips"
             notes.append(f"{clipped:,} of {len(scene):,} Gaussians have {title}")
-    if format.step is not None:
-        coarse = int((format.step(arrays["means"]) > _COARSE * np.exp(scales.astype(np.float64))).sum())
-        if coarse:
-            moved = f"{format.title} moves {coarse:,} of {len(scene):,} Gaussians"
-            notes.append(f"{moved} by up to more than their size, because others are far away")
     return tuple(notes)
 
 
@@ -334,38 +307,14 @@ def encode_scene(
 
 def arrays_of(scene: Scene) -> Arrays:
     """Return the arrays of a scene for a writer, which share memory with its tensors."""
-    return {name: held(getattr(scene, name)).detach().cpu().float().numpy() for name in TENSORS}
-
-
-def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: SceneColumns) -> None:
-    """Read the vertex element in blocks. Large files are read with as many threads as PyTorch uses.
-
-    plyfile would map the file, which takes as long, but kills the process if another program truncates the file.
-    """
-    dtype, count = header.vertex.dtype, header.vertex.count
-    step = max(1, READ_BYTES // dtype.itemsize)
-
-    def read(starts: range) -> None:
-        buffer = np.empty(min(step, count) * dtype.itemsize, np.uint8)
-        for start in starts:
-            part = buffer[: min(step, count - start) * dtype.itemsize]
-            file.read(offset + start * dtype.itemsize, part)
-            into.take(start, part.view(dtype))
-
-    threads = torch.get_num_threads()
-    if threads == 1 or count <= 4 * step:
-        read(range(0, count, step))
-        return
-    with ThreadPoolExecutor(threads, thread_name_prefix="scene") as pool:
-        for done in [pool.submit(read, range(i * step, count, threads * step)) for i in range(threads)]:
-            done.result()
+    return {name: getattr(scene, name).detach().cpu().float().numpy() for name in TENSORS}
 
 
 def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
     """Read the vertex element of a text file as a structured array [rows]."""
     with path.open("rb") as file:
         file.seek(len(header.raw))
-        if any(b"_" in block for block in iter(lambda: file.read(READ_BYTES), b"")):  # Python parses 1_0 as 10
+        if any(b"_" in block for block in iter(lambda: file.read(1 << 20), b"")):  # Python parses 1_0 as 10
             raise SceneError(
                 f"{path}: cannot be read as PLY: there is a '_' among its numbers. Export the scene again."
             )
@@ -383,6 +332,12 @@ def file_stamp(path: Path) -> tuple[int, int]:
     with reading_scene(path):
         status = path.stat()
     return status.st_size, status.st_mtime_ns
+
+
+def check_unchanged(path: Path, stamp: tuple[int, int]) -> None:
+    """Raise SceneError if a file's size or modification time differs from an earlier `stamp`."""
+    if file_stamp(path) != stamp:
+        raise changed(path)
 
 
 def read_property(file: SceneFile, name: str) -> Tensor:
@@ -406,8 +361,7 @@ def read_property(file: SceneFile, name: str) -> Tensor:
     else:
         offset = element_offsets(file.path, header)["vertex"]
         rows = np.array(np.memmap(file.path, header.vertex.dtype, "r", offset, (header.vertex.count,))[name])
-    if file_stamp(file.path) != file.stamp:
-        raise changed(file.path)
+    check_unchanged(file.path, file.stamp)
     if file.retained is not None:
         rows = rows[file.retained]
     return torch.from_numpy(rows.astype(np.float64 if rows.dtype.kind != "f" else rows.dtype.newbyteorder("=")))
@@ -415,45 +369,18 @@ def read_property(file: SceneFile, name: str) -> Tensor:
 
 #: Log scale of the missing axis of flat Gaussians. In any scene, their thickness is far below rounding errors.
 FLAT = -40.0
-#: Rounding error of positions, relative to the median standard deviation of Gaussians, above which it is noted.
-MAX_ROUNDED = 0.1
-
-
-@np.errstate(over="ignore")
-def about_rounded_positions(means: NDArray[Any], scales: NDArray[Any]) -> tuple[str, ...]:
-    """Return a note if positions in double precision are too large for float32.
-
-    Args:
-        means: Positions [N, 3] float32.
-        scales: Log scales [N, 3].
-    """
-    error = 0.5 * float(np.spacing(np.nanmedian(np.abs(means), axis=0)).max())
-    fraction = error / max(float(np.exp(np.nanmedian(scales))), 1e-30)
-    if not fraction > MAX_ROUNDED:
-        return ()
-    return (
-        f"positions are rounded to float32 by up to {error:.2g}, {fraction:.1f} times the size of a typical Gaussian; "
-        "subtract an offset from the positions of Gaussians and cameras first",
-    )
 
 
 class SceneColumns:
     """Arrays of a scene, filled block by block from the rows of a file, and the invalid values found in them.
 
-    Args:
-        stored: Layout of SH coefficients that stay in the file and are only checked; None if there are none.
-
     Attributes:
         arrays: float32 arrays by the names of the scene's tensors.
-        retained: Mask [count] bool of valid rows.
-        clamped: Number of infinite opacities in each block that contains any. They are replaced by the logits of
-            almost 0 and 1 that compressed formats use, because exporters write an alpha of 255 as infinity.
     """
 
-    def __init__(self, header: SceneHeader, stored: RowLayout | None) -> None:
+    def __init__(self, header: SceneHeader) -> None:
         ply = header if isinstance(header, PlySceneHeader) else None
-        count, coefficients = header.count, 0 if stored else header.coefficients
-        self._stored = stored
+        count, coefficients = header.count, header.coefficients
         self._sources = ply.sources if ply else {}
         self.arrays: dict[str, NDArray[Any]] = {
             name: np.empty((count, len(columns)), np.float32) for name, columns in PROPERTIES.items()
@@ -469,43 +396,27 @@ class SceneColumns:
             self._targets[f"f_rest_{channel * stride + i}"] = self.arrays["sh_rest"][:, i, channel]
         if ply and is_flat(ply.ply.vertex.kinds) and "scale_2" not in self._sources:
             self._targets.pop("scale_2")[:] = FLAT
-        self.retained = np.ones(count, np.bool_)
-        self.clamped: list[int] = []
-        self._stored_flaws: list[NDArray[np.int64]] = []
 
     @np.errstate(over="ignore")  # a double too large for float32 becomes infinite and is reported as such
     def take(self, start: int, rows: NDArray[Any]) -> None:
-        """Copy a structured block of rows to the arrays from row `start` on. Thread-safe for different blocks."""
+        """Copy a structured block of rows to the arrays from row `start` on."""
         block = slice(start, start + len(rows))
         for name, target in self._targets.items():
             source = self._sources.get(name, name)
             target[block] = (rows[source] / 255 - COLOR_OFFSET) / SH_C0 if source in RGB else rows[source]
         if FILTER_3D in (rows.dtype.names or ()):
             apply_filter(self.arrays["scales"][block], self.arrays["opacities"][block], rows[FILTER_3D])
-        self.check(start, len(rows), rows)
 
-    def check(self, start: int, count: int, rows: NDArray[Any] | None = None) -> None:
-        """Record invalid values of `count` rows from `start` on.
+    def clamp_opacities(self) -> int:
+        """Replace infinite opacities, and return their number.
 
-        `rows` is required if SH coefficients stay in the file.
+        They become the logits of almost 0 and 1 that compressed formats use, because exporters write an alpha of 255
+        as infinity.
         """
-        block = slice(start, start + count)
-        opacities = self.arrays["opacities"][block]
+        opacities = self.arrays["opacities"]
         infinite = np.isinf(opacities)
-        if infinite.any():
-            self.clamped.append(int(infinite.sum()))
-            np.clip(opacities, OPACITY_LOGITS[0], OPACITY_LOGITS[-1], out=opacities, where=infinite)
-        tables = [array[block].reshape(count, -1) for array in self.arrays.values()]
-        if self._stored is not None and rows is not None:
-            first = self._stored.column // 4
-            table = rows.view(np.uint8).view("<f4").reshape(count, -1)
-            tables.append(table[:, first : first + 3 * self._stored.coefficients])
-        valid = (self.arrays["quats"][block] != 0).any(axis=1)
-        if valid.all() and all(bool(np.isfinite(table).all()) for table in tables):
-            return
-        self.retained[block] = valid & np.all([np.isfinite(table).all(axis=1) for table in tables], axis=0)
-        if self._stored is not None:
-            self._stored_flaws.append(np.stack([np.isnan(tables[-1]).sum(axis=0), np.isinf(tables[-1]).sum(axis=0)]))
+        np.clip(opacities, OPACITY_LOGITS[0], OPACITY_LOGITS[-1], out=opacities, where=infinite)
+        return int(infinite.sum())
 
     def valid_rows(self, path: Path, drop_invalid: bool, surplus: tuple[str, ...]) -> NDArray[np.bool_] | None:
         """Return the mask [count] bool of valid rows; None if all are valid.
@@ -517,30 +428,32 @@ class SceneColumns:
         Raises:
             SceneError: If invalid rows may not be dropped, or no valid rows remain.
         """
-        if self.retained.all():
+        valid = (self.arrays["quats"] != 0).any(axis=1)
+        for block in blocks(len(valid)):
+            for array in self.arrays.values():
+                valid[block] &= np.isfinite(array[block]).reshape(block.stop - block.start, -1).all(axis=1)
+        if valid.all():
             return None
-        counts = {name: (np.isnan(values).sum(), np.isinf(values).sum()) for name, values in self._targets.items()}
-        if self._stored_flaws:
-            counts |= {f"f_rest_{i}": numbers for i, numbers in enumerate(np.sum(self._stored_flaws, axis=0).T)}
         invalid = []
-        for name, numbers in counts.items():
-            kinds = [f"{number} {what}" for number, what in zip(numbers, ("NaN", "infinite"), strict=True) if number]
+        for name, values in self._targets.items():
+            numbers = {"NaN": np.isnan(values).sum(), "infinite": np.isinf(values).sum()}
+            kinds = [f"{number} {what}" for what, number in numbers.items() if number]
             invalid += [f"{name} ({', '.join(kinds)})"] if kinds else []
         unrotated = np.flatnonzero((self.arrays["quats"] == 0).all(axis=1))
-        bad = int((~self.retained).sum())
+        bad = int((~valid).sum())
         flawed = [f"hold NaN or infinite values: {', '.join(invalid)}"] if invalid else []
         if len(unrotated):
             flawed += [
                 f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {unrotated[0]})"
             ]
-        summary = f"{path}: {bad} of {len(self.retained)} Gaussians {', or '.join(flawed)}"
+        summary = f"{path}: {bad} of {len(valid)} Gaussians {', or '.join(flawed)}"
         if surplus:
             raise SceneError(f"{summary}. Its rows are not as the header declares: {surplus[0]}.")
-        if bad == len(self.retained):
+        if bad == len(valid):
             raise SceneError(f"{summary}. No valid Gaussians remain. Train or export the scene again.")
         if not drop_invalid:
             raise SceneError(f"{summary}. Use --drop-invalid to drop these Gaussians.")
-        return self.retained
+        return valid
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # invalid values are reported later
@@ -565,6 +478,331 @@ def apply_filter(scales: NDArray[np.float32], opacities: NDArray[np.float32], de
     filtered = log_opacity - np.log(-np.expm1(log_opacity))
     scales[:] = after
     opacities[:] = np.where(ratio < 0, filtered, logits)
+
+
+class _Changes(NamedTuple):
+    """Changes of the rows of a PLY.
+
+    Attributes:
+        columns: New values of all Gaussians, by property.
+    """
+
+    columns: dict[str, NDArray[np.float32]]
+    attenuated: list[str]
+    factor: float
+
+    def times(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return attenuated coefficients in float32; positive zeros if the factor is 0."""
+        return values * np.float32(self.factor) if self.factor else np.zeros_like(values)
+
+
+def write_stylized(
+    source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0, pad_sh: bool = False
+) -> None:
+    """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
+
+    plyfile would change them: it moves `obj_info` behind comments, writes other line ends, names of types and numbers
+    in text, refuses comments that are not ASCII, and drops what follows the last element.
+
+    A color keeps its bytes too if its float32 value does not change. The rest of the file changes in these cases:
+
+    - With an SH attenuation, f_rest_* change.
+    - Colors of 8 bits in red, green and blue, for programs that show only points, become those of f_dc_*.
+    - Dropped rows are absent, and the count in the header is adjusted.
+    - Each piece of a split Gaussian has a row with its own position, scale and opacity, and the count is adjusted.
+    - If the requested render mode differs from the file's, it is written to comments of the header.
+
+    A scene in another format is written as a PLY by `encode_scene`, and so is one with `pad_sh`.
+
+    Args:
+        source: File from `read_scene`.
+        target: File to write; may be the source itself.
+        sh_dc: Finite coefficients, [N, 3] with N = len(source.scene).
+        sh_attenuation: SH attenuation of f_rest_*, 0 to 1; see `Scene.attenuated`.
+        pad_sh: Whether to write the usual properties alone, with SH coefficients of degree 3; see `encode_scene`.
+
+    Raises:
+        SceneError: If the source file has changed since it was read, or cannot store attenuated coefficients.
+        OutputError: If the target cannot be written.
+        ValueError: If sh_dc has the wrong shape or non-finite values.
+
+    Example:
+        >>> source = load_scene("scene.ply")
+        >>> write_stylized(source, Path("gray.ply"), torch.zeros_like(source.scene.sh_dc))
+        >>> bool(load_scene("gray.ply").scene.sh_dc.any())
+        False
+    """
+    with atomic_path(target) as temporary, temporary.open("wb") as output:
+        encode_stylized(output, source, sh_dc, target, sh_attenuation=sh_attenuation, pad_sh=pad_sh)
+
+
+def encode_stylized(
+    output: BinaryIO,
+    source: SceneFile,
+    sh_dc: Tensor,
+    target: Path,
+    *,
+    sh_attenuation: float = 0.0,
+    pad_sh: bool = False,
+) -> None:
+    """Write the PLY of a scene with new colors to a stream; see `write_stylized`. `target` is named in messages."""
+    if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):
+        raise ValueError(f"sh_dc must be finite and {tuple(source.scene.sh_dc.shape)}, got {tuple(sh_dc.shape)}")
+    check_unchanged(source.path, source.stamp)
+    colors = sh_dc.detach().to("cpu", torch.float32)
+    if source.header is None or pad_sh:
+        scene = replace(source.scene.attenuated(sh_attenuation), sh_dc=colors)
+        encode_scene(output, scene, PLY, target, pad_sh=pad_sh)
+        return
+    check_sh_attenuation(source, sh_attenuation)
+    factor = attenuation_factor(sh_attenuation)
+    rest = [] if factor == 1 else [name for name in source.header.vertex.kinds if _REST.fullmatch(name)]
+    changes = _Changes(_new_columns(source, source.header, colors), rest, factor)
+    raw = source.header.raw
+    if source.retained is not None or source.copies is not None:
+        start, stop = source.header.vertex.count_span
+        raw = raw[:start] + str(len(source.scene)).encode() + raw[stop:]
+    with source.path.open("rb") as file:
+        output.write(retagged(raw, source.header, source.scene.rendering))
+        write = _write_text if source.header.text else _write_binary
+        write(source, source.header, changes, file, output)
+
+
+def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
+    """Check that a file can store attenuated coefficients. Scenes of other formats than PLY become a float32 PLY.
+
+    Raises:
+        SceneError: If the coefficients are stored as integers.
+    """
+    if source.header is None or not attenuation:
+        return
+    kinds = source.header.vertex.kinds
+    integers = [name for name, kind in kinds.items() if _REST.fullmatch(name) and kind[0] != "f"]
+    if integers:
+        raise SceneError(
+            f"{source.path}: {integers[0]} is stored as integers, which cannot be attenuated. Convert it to float "
+            "first, or leave --sh-attenuation out."
+        )
+
+
+def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> dict[str, NDArray[np.float32]]:
+    """Return the columns that may differ from the file: colors and, if Gaussians were split, their shapes.
+
+    Colors that the file also has with 8 bits are among them.
+    """
+    columns, kinds = dict(zip(PROPERTIES["sh_dc"], colors.numpy().T, strict=True)), header.vertex.kinds
+    if all(kinds.get(name) == "u1" for name in RGB):
+        shown = (255 * (COLOR_OFFSET + SH_C0 * colors.double()).clamp(0, 1)).round().float()
+        columns |= dict(zip(RGB, shown.numpy().T, strict=True))
+    if source.copies is not None:
+        columns["opacity"] = source.scene.opacities.numpy()
+        for names, values in ((PROPERTIES["means"], source.scene.means), (PROPERTIES["scales"], source.scene.scales)):
+            columns |= dict(zip(names, values.numpy().T, strict=True))
+        columns[FILTER_3D] = np.zeros(len(source.scene), np.float32)  # the shapes are those after the filter
+    return {name: values for name, values in columns.items() if name in kinds}
+
+
+def _row_blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
+    """Yield, for each block of file rows, its length, the number of copies of each row, and the slice of Gaussians."""
+    times = np.ones(rows, np.int64) if source.retained is None else source.retained.astype(np.int64)
+    if source.copies is not None:
+        times[times > 0] = source.copies
+    ends = np.append(0, times.cumsum())
+    for start in range(0, rows, BLOCK_ROWS):
+        stop = min(start + BLOCK_ROWS, rows)
+        yield stop - start, times[start:stop], slice(ends[start], ends[stop])
+
+
+def _write_binary(
+    source: SceneFile, header: PlyHeader, changes: _Changes, file: io.BufferedReader, output: BinaryIO
+) -> None:
+    dtype = header.vertex.dtype
+    before = element_offsets(source.path, header)["vertex"] - len(header.raw)
+    file.seek(len(header.raw))
+    output.write(file.read(before))
+    buffer = bytearray(min(BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
+    for count, times, gaussians in _row_blocks(source, header.vertex.count):
+        part = memoryview(buffer)[: count * dtype.itemsize]
+        if file.readinto(part) != len(part):
+            raise changed(source.path)
+        rows = np.frombuffer(part, dtype)
+        if not (times == 1).all():
+            rows = np.repeat(rows, times)
+        for name, values in changes.columns.items():
+            column = values[gaussians]
+            different = rows[name].astype(np.float32) != column
+            rows[name][different] = column[different]
+        for name in changes.attenuated:
+            rows[name] = changes.times(rows[name].astype(np.float32))
+        output.write(rows.view(np.uint8).data)
+    shutil.copyfileobj(file, output)
+    check_unchanged(source.path, source.stamp)
+
+
+def _write_text(
+    source: SceneFile, header: PlyHeader, changes: _Changes, file: io.BufferedReader, output: BinaryIO
+) -> None:
+    vertex = header.vertex
+    before = itertools.takewhile(lambda element: element is not vertex, header.elements.values())
+    order = [*vertex.kinds]
+    slots = [(order.index(name), vertex.kinds[name]) for name in (*changes.columns, *changes.attenuated)]
+    file.seek(len(header.raw))
+    # latin-1 preserves every byte, and newline="" every line end
+    lines = io.TextIOWrapper(file, "latin-1", newline="")
+    for _ in range(sum(element.count for element in before)):
+        output.write(lines.readline().encode("latin-1"))
+    for _, times, gaussians in _row_blocks(source, vertex.count):
+        values = iter(np.stack([column[gaussians] for column in changes.columns.values()], axis=1))
+        for copies in times:
+            line = lines.readline()
+            for _ in range(copies):
+                output.write(_changed_line(line, slots, next(values), changes).encode("latin-1"))
+    for line in lines:
+        output.write(line.encode("latin-1"))
+
+
+def _changed_line(line: str, slots: list[tuple[int, str]], values: NDArray[Any], changes: _Changes) -> str:
+    """Return a row of text with new values. Tokens whose value does not change, and all spacing, are copied.
+
+    Args:
+        line: Row of text.
+        slots: Token index and NumPy type code of each value to replace: those of `values` first, then those to
+            attenuate.
+        values: New values of the first slots.
+    """
+    tokens = list(re.finditer(r"\S+", line))
+    old = np.array([tokens[slot][0] for slot, _ in slots[len(values) :]], dtype=np.float32)
+    values = np.concatenate([values, changes.times(old)])
+    for (slot, kind), value in sorted(zip(slots, values, strict=True), key=lambda pair: -pair[0][0]):
+        token = tokens[slot]
+        if np.float32(token[0]) != value:
+            # shortest text that parses to the same number in the precision that the file declares
+            text = str(value) if kind == "f4" else str(int(value)) if kind == "u1" else repr(float(value))
+            line = line[: token.start()] + text + line[token.end() :]
+    return line
+
+
+def write_colors(path: Path, sh_dc: Tensor) -> None:
+    """Write f_dc_0..2 of each Gaussian in order, as an N x 3 array of little-endian float16 without a header.
+
+    Values are rounded to the nearest float16. The relative error is at most 2^-11, or the absolute error at most 2^-25
+    for values below 2^-14. For displayable colors, the error is less than 0.04 of an 8-bit level. Values beyond +-65504
+    are clamped. The file is written atomically.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    values = sh_dc.detach().cpu().numpy()
+    with atomic_path(path) as temporary, temporary.open("wb") as output:
+        for block in blocks(len(values)):
+            output.write(np.clip(values[block], -_FLOAT16_MAX, _FLOAT16_MAX).astype("<f2").data)
+
+
+#: Largest absolute weight after normalization. Larger ones amplify the rounding errors of the files.
+MAX_WEIGHT = 10.0
+#: Fields in which all scenes must be equal, and what they are called in messages.
+_SAME = {"means": "positions", "quats": "rotations", "scales": "scales", "opacities": "opacities"}
+
+
+def blend_scenes(files: Sequence[SceneFile], weights: Sequence[float]) -> SceneFile:
+    """Return the weighted mean of scenes that differ only in their spherical harmonics.
+
+    Colors before clamping are linear in the coefficients, so the blend's renders are exact blends as long as no color
+    is clamped. A weight below 0 moves the blend away from its scene.
+
+    Args:
+        files: Scenes from `read_scene`, with the same Gaussians in the same order.
+        weights: Weight of each scene. They are divided by their sum.
+
+    Returns:
+        First file with the blended scene, for `save`. If only its degree-0 coefficients differ, a PLY keeps all its
+        other bytes.
+
+    Raises:
+        SettingsError: If a weight is not finite, their sum is not positive, or one is too far from the others.
+        SceneError: If the scenes differ in more than color.
+    """
+    fractions = normalized(weights)
+    first = files[0]
+    for file in files[1:]:
+        check_same_shape(first, file)
+    scenes = [file.scene for file in files]
+    scene = replace(first.scene, sh_dc=_weighted_sum([scene.sh_dc for scene in scenes], fractions))
+    rests = common_rests(scenes)
+    if all(torch.equal(rest, rests[0]) for rest in rests[1:]):
+        return replace(first, scene=scene)
+    # `write_stylized`, which preserves the bytes of a PLY, changes only colors
+    return replace(first, scene=replace(scene, sh_rest=_weighted_sum(rests, fractions)), header=None)
+
+
+def encode_blend(output: BinaryIO, blend: SceneFile, format: SceneFormat, target: Path) -> None:
+    """Write a scene from `blend_scenes` to a stream as `save` would; `target` is named in messages.
+
+    Raises:
+        OutputError: If the format cannot represent the scene.
+        SceneError: If the first scene's file has changed since it was read.
+    """
+    if format is PLY:
+        encode_stylized(output, blend, blend.scene.sh_dc, target)
+    else:
+        encode_scene(output, blend.scene, format, target, axes=blend.axes)
+
+
+def normalized(weights: Sequence[float]) -> list[float]:
+    """Return weights divided by their sum.
+
+    Raises:
+        SettingsError: If a weight is not finite, their sum is not positive, or a result is larger than `MAX_WEIGHT`.
+    """
+    text = ", ".join(f"{weight:g}" for weight in weights)
+    if not all(math.isfinite(weight) and abs(weight) <= 1e100 for weight in weights):  # sums remain finite
+        raise SettingsError(f"The weights {text} are not all finite numbers. Give one for each scene, such as 0.7.")
+    total = math.fsum(weights)
+    if not total > 0:
+        raise SettingsError(f"The weights {text} have the sum {total:g}. Give weights whose sum is greater than 0.")
+    if max(map(abs, weights)) > MAX_WEIGHT * total:
+        raise SettingsError(
+            f"The weights {text} are too large for their sum {total:g}: each must be at most {MAX_WEIGHT:g} times as "
+            "large. Give weights closer to each other."
+        )
+    return [weight / total for weight in weights]
+
+
+def check_same_shape(first: SceneFile, file: SceneFile) -> None:
+    """Raise a SceneError if two scenes differ in more than color."""
+    if len(file.scene) != len(first.scene):
+        raise SceneError(
+            f"{file.path}: has {len(file.scene):,} Gaussians, but {first.path} has {len(first.scene):,}. Give scenes "
+            "with the same Gaussians; refining splits some."
+        )
+    for name, title in _SAME.items():
+        if not torch.equal(getattr(file.scene, name), getattr(first.scene, name)):
+            raise SceneError(
+                f"{file.path}: its Gaussians have other {title} than those of {first.path}. Give a scene and its "
+                "results, all in the same format."
+            )
+
+
+def common_rests(scenes: Sequence[Scene]) -> list[Tensor]:
+    """Return the coefficients above degree 0 of each scene, with zeros for bands that only others have."""
+    rests = [scene.sh_rest for scene in scenes]
+    missing = [max(rest.shape[1] for rest in rests) - rest.shape[1] for rest in rests]
+    return [
+        torch.nn.functional.pad(rest, (0, 0, 0, more)) if more else rest
+        for rest, more in zip(rests, missing, strict=True)
+    ]
+
+
+def _weighted_sum(tensors: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
+    """Return the weighted sum of float32 tensors of one shape, computed in float64."""
+    result = torch.empty_like(tensors[0])
+    largest = torch.finfo(result.dtype).max
+    for rows in blocks(len(result)):
+        total = torch.zeros(result[rows].shape, dtype=torch.float64)
+        for tensor, weight in zip(tensors, weights, strict=True):
+            total += weight * tensor[rows].double()
+        result[rows] = total.clamp(-largest, largest)
+    return result
 
 
 #: Suffixes of USD files: binary, text, and binary.

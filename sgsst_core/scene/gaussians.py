@@ -16,7 +16,6 @@ from torch import Tensor
 from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import CameraError, SceneError
 from sgsst_core.scene.rendering import CLASSIC, Rendering
-from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 
 #: Names of a scene's tensors, in the order of its constructor.
 TENSORS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
@@ -29,8 +28,6 @@ _CHUNK = 1 << 16
 class Scene:
     """Trained 3DGS scene. All tensors are float32 on the CPU and contain only finite values.
 
-    For large scenes, `sh_rest` stays in the scene's file: see `StoredHarmonics`.
-
     Attributes:
         means: [N, 3], world units.
         quats: [N, 4], wxyz, not necessarily normalized.
@@ -39,7 +36,6 @@ class Scene:
         sh_dc: [N, 3], degree-0 coefficients, which stylization optimizes.
         sh_rest: [N, K, 3] with K = 0, 3, 8 or 15 for SH degree 0 to 3.
         rendering: Render mode, which every rasterizer follows.
-        up: World direction of up that the file states; None if it does not.
 
     Example:
         >>> scene = load_scene("scene.ply").scene
@@ -52,9 +48,8 @@ class Scene:
     scales: Tensor  # [N, 3]
     opacities: Tensor  # [N]
     sh_dc: Tensor  # [N, 3]
-    sh_rest: Tensor | StoredHarmonics  # [N, K, 3]
+    sh_rest: Tensor  # [N, K, 3]
     rendering: Rendering = field(default=CLASSIC, kw_only=True)
-    up: tuple[float, float, float] | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -74,7 +69,7 @@ class Scene:
         for part in chosen.split(_CHUNK):
             if used == self.sh_rest.shape[1]:
                 break
-            nonzero = (held(self.sh_rest[part])[:, used:] != 0).any(dim=2).any(dim=0).nonzero()
+            nonzero = (self.sh_rest[part, used:] != 0).any(dim=2).any(dim=0).nonzero()
             used += int(nonzero[-1]) + 1 if len(nonzero) else 0
         return next(degree for degree in range(4) if (degree + 1) ** 2 - 1 >= used)
 
@@ -88,18 +83,13 @@ class Scene:
             return self
         if attenuation == 1:
             return replace(self, sh_rest=self.means.new_zeros((len(self), 0, 3)))
-        factor = attenuation_factor(attenuation)
-        if isinstance(self.sh_rest, StoredHarmonics):
-            return replace(self, sh_rest=self.sh_rest.times(factor))
-        return replace(self, sh_rest=self.sh_rest * factor)
+        return replace(self, sh_rest=self.sh_rest * attenuation_factor(attenuation))
 
     def without_zero_bands(self) -> Scene:
         """Return the scene without the highest SH bands that are zero for all Gaussians; renders do not change."""
         coefficients = (self.used_degree() + 1) ** 2 - 1
         if coefficients == self.sh_rest.shape[1]:
             return self
-        if isinstance(self.sh_rest, StoredHarmonics):
-            return replace(self, sh_rest=self.sh_rest.first(coefficients))
         return replace(self, sh_rest=self.sh_rest[:, :coefficients].contiguous())
 
 
@@ -131,8 +121,6 @@ def checked_scene(scene: Scene, names: Mapping[str, str] | None = None) -> Scene
 
 def _checked(name: str, given: Any, shapes: tuple[tuple[int, ...], ...]) -> Any:
     """Return a field of a scene as a tensor of the first of some shapes; SH coefficients may have any of them."""
-    if isinstance(given, StoredHarmonics):
-        return given
     if not isinstance(given, Tensor | np.ndarray):
         raise SceneError(f"The scene: `{name}` is a {type(given).__name__}. Give a tensor or NumPy array.")
     if not (given.is_floating_point() if isinstance(given, Tensor) else given.dtype.kind == "f"):

@@ -36,12 +36,12 @@ def _direction(means, i, center):
 
 
 @compiled()
-def _sum_of_bands(sh_rest, row, x, y, z, degree, out, i):
-    """Compute out[i] = sum over bands 1 to `degree` of sh_rest[row] in direction x, y, z."""
+def _sum_of_bands(sh_rest, i, x, y, z, degree, out):
+    """Compute out[i] = sum over bands 1 to `degree` of sh_rest[i] in direction x, y, z."""
     b0, b1, b2 = -SH_C1 * y, SH_C1 * z, -SH_C1 * x
     if degree == 1:
         for c in range(3):
-            out[i, c] = b0 * sh_rest[row, 0, c] + b1 * sh_rest[row, 1, c] + b2 * sh_rest[row, 2, c]
+            out[i, c] = b0 * sh_rest[i, 0, c] + b1 * sh_rest[i, 1, c] + b2 * sh_rest[i, 2, c]
         return
     xx, yy, zz = x * x, y * y, z * z
     b3, b4, b5 = _C20 * x * y, _C21 * y * z, _C22 * (2 * zz - xx - yy)
@@ -52,13 +52,13 @@ def _sum_of_bands(sh_rest, row, x, y, z, degree, out, i):
         b10, b11 = _C32 * y * (4 * zz - xx - yy), _C33 * z * (2 * zz - 3 * xx - 3 * yy)
         b12, b13, b14 = _C34 * x * (4 * zz - xx - yy), _C35 * z * (xx - yy), _C36 * x * (xx - 3 * yy)
     for c in range(3):
-        total = b0 * sh_rest[row, 0, c] + b1 * sh_rest[row, 1, c] + b2 * sh_rest[row, 2, c]
-        total += b3 * sh_rest[row, 3, c] + b4 * sh_rest[row, 4, c] + b5 * sh_rest[row, 5, c]
-        total += b6 * sh_rest[row, 6, c] + b7 * sh_rest[row, 7, c]
+        total = b0 * sh_rest[i, 0, c] + b1 * sh_rest[i, 1, c] + b2 * sh_rest[i, 2, c]
+        total += b3 * sh_rest[i, 3, c] + b4 * sh_rest[i, 4, c] + b5 * sh_rest[i, 5, c]
+        total += b6 * sh_rest[i, 6, c] + b7 * sh_rest[i, 7, c]
         if degree == 3:
-            total += b8 * sh_rest[row, 8, c] + b9 * sh_rest[row, 9, c] + b10 * sh_rest[row, 10, c]
-            total += b11 * sh_rest[row, 11, c] + b12 * sh_rest[row, 12, c]
-            total += b13 * sh_rest[row, 13, c] + b14 * sh_rest[row, 14, c]
+            total += b8 * sh_rest[i, 8, c] + b9 * sh_rest[i, 9, c] + b10 * sh_rest[i, 10, c]
+            total += b11 * sh_rest[i, 11, c] + b12 * sh_rest[i, 12, c]
+            total += b13 * sh_rest[i, 13, c] + b14 * sh_rest[i, 14, c]
         out[i, c] = total
 
 
@@ -67,15 +67,4 @@ def rest_colors(sh_rest, means, center, degree, out):
     """Write the sum over bands 1 to `degree` to out [N, 3] float32, for sh_rest [N, K, 3] float32 and means [N, 3]."""
     for i in numba.prange(out.shape[0]):
         x, y, z = _direction(means, i, center)
-        _sum_of_bands(sh_rest, i, x, y, z, degree, out, i)
-
-
-@compiled()
-def block_rest_colors(sh_rest, rows, means, center, degree, out):
-    """Compute `rest_colors` for the Gaussians in some rows [n] int32 of a block sh_rest [R, K, 3], on one core.
-
-    Means [n, 3] and colors out [n, 3] are in the order of the rows.
-    """
-    for i in range(rows.size):
-        x, y, z = _direction(means, i, center)
-        _sum_of_bands(sh_rest, rows[i], x, y, z, degree, out, i)
+        _sum_of_bands(sh_rest, i, x, y, z, degree, out)

@@ -11,16 +11,13 @@ from __future__ import annotations
 
 import functools
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, SH_DEGREES, spherical_harmonics
 from sgsst_core.devices import on_device
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 
 #: Gaussians per chunk: limits the basis [chunk, 15] and the float64 copies to some tens of megabytes.
 _CHUNK = 1 << 17
@@ -56,7 +53,7 @@ def basis(
 
 
 def rest_colors(
-    sh_rest: Tensor | StoredHarmonics,  # [N, K, 3], K = 0, 3, 8 or 15
+    sh_rest: Tensor,  # [N, K, 3], K = 0, 3, 8 or 15
     means: Tensor,  # [N, 3]
     camera: Camera,
 ) -> Tensor:
@@ -67,15 +64,12 @@ def rest_colors(
 
     Raises:
         ValueError: If K does not match a degree of 0 to 3.
-        SceneError: If the coefficients are in a file that was changed after it was first read.
     """
     degree = SH_DEGREES.get(int(sh_rest.shape[1]))
     if degree is None:
         raise ValueError(f"sh_rest must have 0, 3, 8 or 15 coefficients per Gaussian, not {sh_rest.shape[1]}")
     if degree == 0:
         return torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
-    if isinstance(sh_rest, StoredHarmonics):
-        return _stored_rest_colors(sh_rest, means, camera, degree)
     if sh_rest.dtype == torch.float32 and sh_rest.device.type == "cpu":
         return _compiled_rest_colors(sh_rest, means, camera, degree)
     if sh_rest.dtype == torch.float32 and sh_rest.is_cuda and triton_runs_on(sh_rest.device):
@@ -111,24 +105,6 @@ def _compiled_rest_colors(sh_rest: Tensor, means: Tensor, camera: Camera, degree
     values, points = (tensor.detach().cpu().contiguous().numpy() for tensor in (sh_rest, means))
     with kernel_threads():
         kernels.rest_colors(values, points, camera.center.numpy(), degree, colors.numpy())
-    return colors
-
-
-def _stored_rest_colors(sh_rest: StoredHarmonics, means: Tensor, camera: Camera, degree: int) -> Tensor:
-    """Compute `rest_colors` from coefficients in a file, bit-identical to coefficients in memory.
-
-    Each block of the file is used while it is in a core's cache.
-    """
-    from sgsst_core.scene import kernels as kernels
-
-    colors = torch.empty((len(sh_rest), 3))
-    points, center, out = means.detach().cpu().contiguous().numpy(), camera.center.numpy(), colors.numpy()
-
-    def add_up(start: int, block: NDArray[np.float32], rows: NDArray[np.int32]) -> None:
-        chunk = slice(start, start + len(rows))
-        kernels.block_rest_colors(block, rows, points[chunk], center, degree, out[chunk])
-
-    sh_rest.for_blocks(add_up)
     return colors
 
 
@@ -184,7 +160,7 @@ def harmonics_energy(scene: Scene, weights: Tensor) -> float:
     weights = weights / weights.sum()
     energy = 0.0
     for rows in torch.arange(len(scene)).split(_CHUNK):
-        energy += float(weights[rows] @ held(scene.sh_rest[rows]).double().square().sum(dim=(1, 2)))
+        energy += float(weights[rows] @ scene.sh_rest[rows].double().square().sum(dim=(1, 2)))
     colors = scene.sh_dc.double()
     variance = float(weights @ (colors - weights @ colors).square().sum(dim=1))
     return energy / (energy + variance) if energy else 0.0

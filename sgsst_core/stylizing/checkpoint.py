@@ -14,7 +14,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -29,7 +28,6 @@ from sgsst_core.regions import Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
-from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.steps import StylizerState
@@ -102,12 +100,7 @@ def fingerprint(
     arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest)
     for tensor in (*arrays, *style.images):
         digest.update(repr(tuple(tensor.shape)).encode())
-        if isinstance(tensor, StoredHarmonics):
-            tensor.for_blocks(
-                lambda start, block, rows: digest.update(np.ascontiguousarray(block[rows]).data), threads=1
-            )
-        else:
-            digest.update(tensor.contiguous().numpy().data)
+        digest.update(tensor.contiguous().numpy().data)
     if scene.rendering != CLASSIC:
         digest.update(repr(scene.rendering).encode())
     if len(style.images) > 1:

@@ -13,8 +13,7 @@ import torch
 from api.client import Client
 from api.client.transport import RequestError
 from sgsst_core.files.library import save
-from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.files.stylized_ply import blend_scenes
+from sgsst_core.files.scene_file import blend_scenes, read_scene, write_scene
 from tests.api.page.actions import done, submit
 from tests.api.service import Service, wait_for
 from tests.small_scenes import input_files, wall

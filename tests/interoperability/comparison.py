@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.scene.gaussians import TENSORS, Scene
-from sgsst_core.scene.stored_harmonics import held
 
 FOLDER = Path(__file__).parent
 #: Largest differences of opacities after the sigmoid, and of other values, from what another program reads. Compressed
@@ -43,7 +42,7 @@ def assert_same(actual: Scene, expected: Scene, tolerance: float = 1e-4, opaciti
     actual = matched(actual, expected)
     assert actual.sh_degree == expected.sh_degree
     for name in TENSORS:
-        one, other = (held(getattr(each, name)).double() for each in (actual, expected))
+        one, other = (getattr(each, name).double() for each in (actual, expected))
         if name == "opacities":
             one, other = one.sigmoid(), other.sigmoid()
         if name == "quats":

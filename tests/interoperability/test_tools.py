@@ -20,7 +20,6 @@ from sgsst_core.files.formats.scene_format import Y_UP, Frame
 from sgsst_core.files.scene_file import read_scene, write_scene, write_sog_folder
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rendering import Rendering
-from sgsst_core.scene.stored_harmonics import held
 from tests.interoperability.comparison import VALUES, assert_same, matched, read_raw, run_script
 from tests.sgsst_core.splat_scenes import cloud
 
@@ -129,7 +128,7 @@ def test_ksplat_of_reference_writer_is_read(modules: Path, scene: Scene, tmp_pat
     assert float((loaded.sh_dc - within.sh_dc).abs().max()) <= 1.01 / 255 / 0.282
     rounded = replace(loaded, sh_dc=within.sh_dc)
     if level == 2:
-        assert float((held(loaded.sh_rest) - held(within.sh_rest)).abs().max()) <= 1.51 / 255 * 2
+        assert float((loaded.sh_rest - within.sh_rest).abs().max()) <= 1.51 / 255 * 2
         rounded = replace(rounded, sh_rest=within.sh_rest)
     assert_same(rounded, within, 4e-3, opacities=1.01 / 255)
 
@@ -183,7 +182,7 @@ def full_scene() -> Scene:
 
 def with_y_up(scene: Scene) -> Scene:
     """Return a scene rotated by 180 degrees about z, as viewers with y up show it."""
-    arrays = {name: held(getattr(scene, name)).numpy().copy() for name in TENSORS}
+    arrays = {name: getattr(scene, name).numpy().copy() for name in TENSORS}
     Frame.of(Y_UP).apply(arrays)
     return Scene(*(torch.from_numpy(arrays[name]) for name in TENSORS))
 
@@ -221,9 +220,9 @@ def test_spark_reads_written_scenes(modules: Path, full_scene: Scene, tmp_path: 
     expected = read_raw(ours)
     loaded = matched(read_scene(theirs).scene, expected)
     assert_same(replace(loaded, sh_rest=expected.sh_rest), expected, 4e-3)
-    values = held(expected.sh_rest)
+    values = expected.sh_rest
     limit = values.abs().amax(dim=2, keepdim=True).log2().floor().exp2()
-    error = (held(loaded.sh_rest) - values.clamp(-limit, limit)).abs() - limit * 0.51 / 255
+    error = (loaded.sh_rest - values.clamp(-limit, limit)).abs() - limit * 0.51 / 255
     assert float(error.max()) <= VALUES.get(name, 0)
 
 
@@ -265,5 +264,5 @@ def test_babylon_reads_glb(modules: Path, scene: Scene, tmp_path: Path) -> None:
     assert_same(loaded, bare, 0.015, opacities=0.51 / 255)  # its bytes of quaternions are half a step off
     parts = [np.fromfile(f"{theirs}{index}", "u1").reshape(-1, 16)[: len(scene)] for index in range(2)]
     harmonics = np.concatenate(parts, axis=1)[:, :24].reshape(-1, 8, 3)
-    rounded = np.clip(held(expected.sh_rest).double().numpy() * 128 + 128, 0, 255)
+    rounded = np.clip(expected.sh_rest.double().numpy() * 128 + 128, 0, 255)
     assert float(np.abs(harmonics - rounded).max()) <= 0.5

@@ -11,7 +11,7 @@ import torch
 import sgsst_core
 from sgsst_core import Camera, Stylizer
 from sgsst_core.files.library import scene_of_splats
-from sgsst_core.files.stylized_ply import write_stylized
+from sgsst_core.files.scene_file import write_stylized
 from sgsst_core.orbit import orbit
 from sgsst_core.rasterizer import make_rasterizer
 from tests.small_scenes import wall, write_files

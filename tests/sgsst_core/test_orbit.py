@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit import (
     RESOLUTION,
     Orbit,
@@ -21,7 +21,6 @@ from sgsst_core.orbit import (
     cameras_per_ring,
     find_subject,
     find_up,
-    find_upright_subject,
     make_orbit,
     middle_of,
     orbit,
@@ -494,27 +493,6 @@ def test_ground_outside_a_crop_shows_where_up_is() -> None:
     assert not find_up(find_subject(scene.subset(remaining))).sure
     up = make_orbit(scene, REQUEST, remaining).up
     assert (up.name, up.sure, up.ground) == ("x", True, True)
-
-
-@pytest.mark.parametrize(
-    ("comment", "up", "reason"),
-    [
-        ("Vertical axis: 0 0 1", "z", "the file states it"),
-        ("vertical axis: [0.0, -2, 0.0]", "-y", "the file states it"),
-        ("Vertical axis: z", "-z", "the file states it"),
-        ("Vertical axis: y", "x", "there is a flat layer below the whole subject, and none above"),  # Brush's default
-        ("Vertical axis: 0 0 0", "x", "there is a flat layer below the whole subject, and none above"),
-        ("Vertical axis: nan 1 2", "x", "there is a flat layer below the whole subject, and none above"),
-        ("Vertical axis: sideways", "x", "there is a flat layer below the whole subject, and none above"),
-    ],
-)
-def test_up_direction_of_the_file_is_used(tmp_path: Path, comment: str, up: str, reason: str) -> None:
-    path, scene = tmp_path / "scene.ply", joined(ground(4.0), scene_of(ball((0, -0.5, 0), 0.4)))
-    write_scene(path, moved(scene, Rotation.from_euler("z", 90, degrees=True)))
-    path.write_bytes(path.read_bytes().replace(b"element", f"comment {comment}\nelement".encode(), 1))
-    chosen = find_upright_subject(read_scene(path).scene, None)[1]
-    assert (chosen.name, chosen.reason) == (up, reason)
-    assert find_upright_subject(read_scene(path).scene, (0.0, 0.0, -1.0))[1].name == "-z"
 
 
 def test_plan_lines_state_the_reasons_of_an_orbit() -> None:

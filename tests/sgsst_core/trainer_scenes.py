@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import held
 
 
 def splats_of(scene: Scene, activated: bool = False) -> dict[str, Tensor]:
@@ -19,7 +18,7 @@ def splats_of(scene: Scene, activated: bool = False) -> dict[str, Tensor]:
         "quats": scene.quats,
         "opacities": scene.opacities.sigmoid() if activated else scene.opacities,
         "sh0": scene.sh_dc[:, None],
-        "shN": held(scene.sh_rest),
+        "shN": scene.sh_rest,
     }
 
 

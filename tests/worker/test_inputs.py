@@ -16,21 +16,16 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData, PlyElement
-from torch import Tensor
 
 from sgsst_core import container
 from sgsst_core.errors import ImageError, SceneError, SceneTooLargeError
-from sgsst_core.files import scene_file
 from sgsst_core.files.formats import EXTRA_FORMATS
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.images import save_png
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
-from sgsst_core.orbit import orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import TENSORS, Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors
-from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.files.formats.samples import rewritten
 from tests.small_scenes import cameras, wall, write_files
 from tests.worker.ranks.spawn import on_ranks
@@ -220,29 +215,6 @@ def test_compressed_scene_needs_memory_of_its_floats(tmp_path: Path) -> None:
         little = patch.object(container, "memory", return_value=container.Memory(1 << 40, 616 * 4 * 59))
         with little, pytest.raises(SceneTooLargeError, match="616 Gaussians need"):
             read_shared_scene(path, ALONE)
-
-
-def shared_colors(collectives: Collectives, path: Path, drop: bool) -> tuple[bool, Tensor, Tensor]:
-    """Return whether this rank leaves SH coefficients in the file, the coefficients, and the colors in a view."""
-    with patch.object(scene_file, "HELD_BYTES", 0):
-        scene = read_shared_scene(path, collectives, drop_invalid=drop)[0].scene
-    stored = isinstance(scene.sh_rest, StoredHarmonics)
-    return stored, held(scene.sh_rest), rest_colors(scene.sh_rest, scene.means, orbit(scene, 1)[0])
-
-
-@linux
-@pytest.mark.parametrize("drop", [False, True])
-def test_every_rank_reads_stored_harmonics_from_the_file(tmp_path: Path, drop: bool) -> None:
-    scene = wall(sh_degree=2)
-    if drop:
-        scene.opacities[7] = float("nan")
-    write_scene(tmp_path / "scene.ply", scene)
-    plain = read_scene(tmp_path / "scene.ply", drop_invalid=drop).scene
-    colors = rest_colors(plain.sh_rest, plain.means, orbit(plain, 1)[0])
-    for stored, values, own in on_ranks(2, shared_colors, tmp_path / "scene.ply", drop):
-        assert stored
-        assert torch.equal(values, held(plain.sh_rest))
-        assert torch.equal(own, colors)
 
 
 def refused(collectives: Collectives, path: Path) -> str:

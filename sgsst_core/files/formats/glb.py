@@ -42,7 +42,6 @@ from sgsst_core.files.formats.scene_format import (
     RenderTag,
     SceneFormat,
     SceneHeader,
-    about_part,
     blocks,
     extras_of,
     extras_tag,
@@ -176,8 +175,6 @@ def _read_header(start: FileStart) -> GlbHeader:
         linear = "colors are linear, and converted to sRGB for each Gaussian; where Gaussians overlap, renders differ"
         notes += [linear] if any(part.linear for part in parts) else []
         notes += [note for part in parts if part.spz for note in part.spz.notes]
-        declared = whole_number("byteLength", document["buffers"][0].get("byteLength", len(data)))
-        notes += (*about_part(path, data.start + declared, data.stop), *about_part(path, data.stop, start.size))
     except WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
     count = sum(part.count for part in parts)

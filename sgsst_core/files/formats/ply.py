@@ -11,7 +11,7 @@ and CR line ends.
 
 Comments state render modes: Brush's `SplatRenderMode: mip` (also of splat-transform and gsplat), Postshot's
 `postshot.anti_aliasing=1`, `antialiased 1`, fVDB's `fvdb_ply_af_8198767135antialias|int64|1` and `...eps2d|double|0.3`,
-and our own `eps2d 0.1`. Other comments that seem to state one give a warning.
+and our own `eps2d 0.1`.
 
 In a compressed PLY, a Gaussian takes 16 bytes, and one byte per SH coefficient above degree 0. Positions and log scales
 are quantized to 11, 10 and 11 bits, and colors to 8 bits per channel, within bounds shared by a chunk of 256 Gaussians.
@@ -22,7 +22,6 @@ Opacities have 8 bits. Rotations have three components of 10 bits each. SH coeff
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -45,15 +44,12 @@ from sgsst_core.files.formats.scene_format import (
     RenderTag,
     SceneFormat,
     SceneHeader,
-    about_part,
-    about_surplus,
     along_curve,
     blocks,
     join_bits,
     opacity_bytes,
     read_bytes,
     read_rows,
-    refuse_text_transfer,
     stated,
     truncated,
     usable_eps2d,
@@ -96,7 +92,7 @@ def _read_header(start: FileStart) -> PlySceneHeader:
     if sources:
         notes.append(f"{', '.join(dict.fromkeys(sources.values()))} become the usual properties of a stylized PLY")
     fields = (header.vertex.count, coefficients, header, stored, sources)
-    return PlySceneHeader(PLY, *fields, notes=tuple(notes), tag=ply_tag(header), up=stated_up(header))
+    return PlySceneHeader(PLY, *fields, notes=tuple(notes), tag=ply_tag(header))
 
 
 def _sources(kinds: dict[str, str]) -> dict[str, str]:
@@ -123,7 +119,10 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
     known = {*kinds, *sources, *(["scale_2"] if is_flat(kinds) else [])}
     missing = [name for names in (*PROPERTIES.values(), ("opacity",)) for name in names if name not in known]
     if vertex is None or missing:
-        raise SceneError(f"{path}: is not a 3DGS scene but {_likely_content(header)}; missing: {', '.join(missing)}.")
+        raise SceneError(
+            f"{path}: is not a 3DGS scene; missing: {', '.join(missing)}. Of a mesh or a point cloud, train Gaussians "
+            "first."
+        )
     if vertex.count == 0:
         raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
     for name in PROPERTIES["sh_dc"]:
@@ -142,17 +141,6 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
             f"{path}: f_rest properties are not numbered 0 to {len(rest) - 1}; missing: {', '.join(absent)}."
         )
     return len(rest) // 3, sources
-
-
-def _likely_content(header: PlyHeader) -> str:
-    """Guess what a PLY without Gaussians contains, for the error message."""
-    vertex = header.elements.get("vertex")
-    names = set(vertex.kinds) if vertex else set()
-    if "face" in header.elements:
-        return "a mesh (it has faces)"
-    if {"x", "y", "z"} <= names and not names & {"opacity", "scale_0", "rot_0", "f_dc_0"}:
-        return "a point cloud (train Gaussians on it first)"
-    return "something else" if vertex else "a PLY without vertices"
 
 
 def write_ply(output: BinaryIO, arrays: Arrays, rendering: Rendering, least_coefficients: int = 0) -> None:
@@ -218,16 +206,8 @@ _MODE = re.compile(
     re.IGNORECASE,
 )
 _EPS2D = re.compile(r"[\w.|]*?(?:eps_?2d|kernel_?size)" + _IS, re.IGNORECASE)
-_UP = re.compile(r"vertical axis:(.{1,100})", re.IGNORECASE)
-#: Directions of up by the names of axes; in Brush, up is -y unless the data set states another.
-_NAMED_UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
-#: Comments that seem to state a render mode.
-_ABOUT_MODE = re.compile(
-    r"anti[-_ ]?alias|(?<![a-z])mip(?:map|[-_ ]?splat|(?![a-z]))|filter[-_ ]?3d|low[-_ ]?pass|eps_?2d|kernel"
-    r"|(?:render|raster)\w{0,9}[-_ ]?mode",
-    re.IGNORECASE,
-)
-_UNSCENTED = re.compile(r"\b3dgr?ut\b|\b3dgrt\b|\bunscented", re.IGNORECASE)
+#: Bytes after the data that mean nothing: zeros, blanks, and the end-of-file mark of DOS; and most of them.
+_PADDING, _MAX_PADDING = b"\0 \t\r\n\x1a", 1 << 16
 
 
 @dataclass(frozen=True)
@@ -282,11 +262,6 @@ class PlyHeader:
     def comments(self) -> list[str]:
         """Return the comments, without their keyword."""
         return [comment for line in self.raw.split(self.newline) if (comment := comment_of(line)) is not None]
-
-    @property
-    def has_double_positions(self) -> bool:
-        """Return whether positions are stored in double precision."""
-        return self.vertex.kinds.get("x") == "f8"
 
     @property
     def vertex(self) -> PlyElement:
@@ -394,28 +369,26 @@ def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
 
 
 def surplus(path: Path, header: PlyHeader) -> tuple[str, ...]:
-    """Return the note on what follows the last element of a file; nothing if only padding does.
+    """Return the note on what follows the last element of a binary file; nothing if only padding does.
 
     Raises:
-        SceneError: If the file was probably transferred as text, or is shorter than declared.
+        SceneError: If the file is shorter than declared.
     """
     if header.text:
-        with path.open(encoding="latin-1") as lines:
-            lines.seek(len(header.raw))
-            rows = sum(1 for line in lines if line.strip(" \t\r\n\x1a"))
-        rows -= sum(element.count for element in header.elements.values())
-        return about_surplus(max(0, rows), "row")
+        return ()
     last = [*header.elements.values()][-1]
     end = element_offsets(path, header)[last.name] + last.count * last.dtype.itemsize
-    size = path.stat().st_size
-    refuse_text_transfer(path, len(header.raw), header.newline, end, size)
-    return about_part(path, end, size)
+    data = read_bytes(path, end, end + _MAX_PADDING + 1)
+    if len(data) <= _MAX_PADDING and not data.strip(_PADDING):
+        return ()
+    more = path.stat().st_size - end
+    return (f"the file is longer than its header declares by {more} B, which are not read; copy or export it again",)
 
 
 def ply_tag(header: PlyHeader) -> RenderTag:
     """Return the render mode that the comments and properties of a PLY state; the last comment counts."""
     names = header.vertex.kinds
-    mode, eps2d, reasons, warnings = None, None, [], []
+    mode, eps2d, reasons = None, None, []
     for comment in header.comments:
         if (match := _MODE.fullmatch(comment)) and match[1].lower() in _MODES:
             mode = _MODES[match[1].lower()]
@@ -423,13 +396,6 @@ def ply_tag(header: PlyHeader) -> RenderTag:
         elif (match := _EPS2D.fullmatch(comment)) and (blur := usable_eps2d(match[1])):
             eps2d = blur
             reasons.append(f"the comment {comment!r}")
-        elif _UNSCENTED.search(comment):
-            reason = f"the comment {comment!r} names another projection"
-            differs = "renders differ where Gaussians are large or lenses were distorted"
-            warnings.append(("by linearized projection (EWA)", f"{reason}; {differs}"))
-        elif _ABOUT_MODE.search(comment):
-            advice = "if the scene was trained antialiased, add --render-mode antialiased"
-            warnings.append(("classic unless stated otherwise", f"the comment {comment[:80]!r} is unknown; {advice}"))
     if mode is None and FILTER_3D in names:
         mode = "antialiased"
         reasons.append(f"the property {FILTER_3D} of Mip-Splatting")
@@ -439,19 +405,7 @@ def ply_tag(header: PlyHeader) -> RenderTag:
     usual = _MIP_EPS2D if FILTER_3D in names or "Exported from Brush" in header.comments else EPS2D
     if eps2d is None:
         eps2d = usual if mode == "antialiased" else EPS2D
-    return stated(mode or "classic", ", ".join(reasons), eps2d, tuple(warnings))
-
-
-def stated_up(header: PlyHeader) -> tuple[float, float, float] | None:
-    """Return the direction of up that Brush's comment states; None for its default, which means nothing."""
-    up = None
-    for match in filter(None, map(_UP.fullmatch, header.comments)):
-        try:
-            x, y, z = map(float, _NAMED_UP.get(match[1].strip().lower()) or re.split(r"[\s,]+", match[1].strip(" []")))
-        except ValueError:
-            continue
-        up = (x, y, z) if 0 < math.hypot(x, y, z) < math.inf and (x, y, z) != _NAMED_UP["y"] else None
-    return up
+    return stated(mode or "classic", ", ".join(reasons), eps2d)
 
 
 def is_flat(names: Collection[str]) -> bool:
@@ -548,8 +502,7 @@ def _read_compressed_header(start: FileStart) -> CompressedPlyHeader:
             )
         _check_kinds(path, harmonics, "u1", tuple(f"f_rest_{i}" for i in range(number)))
     element_offsets(path, header)
-    tag, up = ply_tag(header), stated_up(header)
-    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, number // 3, header, tag=tag, up=up)
+    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, number // 3, header, tag=ply_tag(header))
 
 
 def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, ...]) -> None:
@@ -671,18 +624,7 @@ def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     return np.concatenate(bounds_of, axis=1), np.stack(packed, axis=1)
 
 
-def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the largest distance between positions that can be stored in the chunk of each Gaussian, [n]."""
-    order = along_curve(means)
-    starts = np.arange(0, len(means), CHUNK_ROWS)
-    ends = (side.reduceat(means[order].astype(np.float64), starts) for side in (np.maximum, np.minimum))
-    steps = np.empty(len(means))
-    steps[order] = (np.subtract(*ends) / (2047, 1023, 2047)).max(axis=1)[np.arange(len(means)) // CHUNK_ROWS]
-    return steps
-
-
 COMPRESSED_PLY = SceneFormat(
     *("compressed.ply", "compressed PLY", 61, _matches_compressed, _read_compressed_header, _read, _write),
     ranges={"scales": (-_LARGEST_SCALE, _LARGEST_SCALE), "sh_rest": (-4.0, 4.0)},
-    step=_step,
 )

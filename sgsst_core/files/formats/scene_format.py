@@ -1,6 +1,6 @@
 """Registry entry of a scene format, and what several formats need: units, quantization, axes.
 
-A file may state its render mode, and may hold content beyond what its header declares, which is counted and reported.
+A file may state its render mode.
 
 Programs confuse logarithms of scales and logits of opacities with the values themselves, which gives plausible numbers.
 Formats that store deviations and opacities convert them here, and all scenes are checked after they were read.
@@ -13,12 +13,12 @@ A PLY has the axes of its cameras: x right, y down, z forward. A `Frame` convert
 
 from __future__ import annotations
 
-import codecs
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +37,6 @@ BLOCK_ROWS = 1 << 16
 #: float32 arrays of N Gaussians by the names of `Scene`'s tensors: means, scales and sh_dc [N, 3], quats [N, 4] (wxyz),
 #: opacities [N] (logits), sh_rest [N, coefficients, 3].
 Arrays = dict[str, NDArray[np.float32]]
-#: Padding that programs leave after the data: zeros, blanks, and the end-of-file mark of DOS.
-_BLANKS, _PADDING = b" \t\r\n\x1a", b"\0 \t\r\n\x1a"
-#: Maximum bytes of padding, and of data that are searched for traces of a transfer as text.
-_MAX_PADDING, _SAMPLE_BYTES = 1 << 16, 1 << 20
-#: Least number of line ends that show a transfer as text if all of them are CR LF.
-_MIN_LINE_ENDS = 8
 
 
 @dataclass(frozen=True)
@@ -79,13 +73,34 @@ class FileStart:
     offset: int = 0
 
 
-class OpenScene(Protocol):
-    """Open scene file, which raises a SceneError if it changes or cannot be read."""
+@dataclass(frozen=True)
+class OpenScene:
+    """Open scene file.
+
+    It is not memory-mapped: if another program truncates a mapped file, the next access kills the process (SIGBUS).
+    """
 
     path: Path
+    stream: BufferedReader
 
     def read(self, offset: int, buffer: NDArray[np.uint8]) -> None:
-        """Read bytes of the file, starting at `offset`, until a buffer is full."""
+        """Read bytes of the file, starting at `offset`, until a buffer is full.
+
+        Raises:
+            SceneError: If the file is too short.
+            OSError: If it cannot be read.
+        """
+        self.stream.seek(offset)
+        if self.stream.readinto(buffer.data) < len(buffer):
+            raise changed(self.path)
+
+
+def changed(path: Path) -> SceneError:
+    """Return the error for a file that was changed after it was read."""
+    return SceneError(
+        f"{path}: was changed after it was read; the new colors may belong to other Gaussians. "
+        "Put the original file back and run again."
+    )
 
 
 @dataclass(frozen=True)
@@ -96,7 +111,6 @@ class SceneHeader:
         coefficients: SH coefficients per color channel above degree 0.
         notes: Notes on contents that are not read, or not read as stored.
         axes: Axes that the scene has in an SPZ, see `spz`.
-        up: Direction of up; None if the file does not state it.
     """
 
     format: SceneFormat
@@ -104,7 +118,6 @@ class SceneHeader:
     coefficients: int
     notes: tuple[str, ...] = field(default=(), kw_only=True)
     axes: str = field(default="rub", kw_only=True)
-    up: tuple[float, float, float] | None = field(default=None, kw_only=True)
     tag: RenderTag = field(default=UNTAGGED, kw_only=True)
 
 
@@ -130,8 +143,6 @@ class SceneFormat:
             without path if it cannot represent the arrays. None if the format is only read.
         ranges: Lowest and highest value by the name of the array. That of "scales" holds for the largest of each
             Gaussian.
-        step: Distance between positions that can be stored, for positions [n, 3]: [n], or the same for all. None if
-            positions are floats.
         has_axes: Whether the writer takes axes as a fourth argument.
     """
 
@@ -144,7 +155,6 @@ class SceneFormat:
     write: Callable[..., None] | None = None
     media_type: str = "application/octet-stream"
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    step: Callable[[NDArray[np.float32]], NDArray[np.float64]] | None = None
     has_axes: bool = False
 
     @property
@@ -153,7 +163,7 @@ class SceneFormat:
         return f".{self.name}"
 
 
-def stated(mode: str, reason: str, eps2d: float | None = None, warnings: tuple[tuple[str, str], ...] = ()) -> RenderTag:
+def stated(mode: str, reason: str, eps2d: float | None = None) -> RenderTag:
     """Return the tag of a file that states a render mode, with a warning if the scene can only be approximated.
 
     Args:
@@ -161,12 +171,12 @@ def stated(mode: str, reason: str, eps2d: float | None = None, warnings: tuple[t
         reason: Part of the file that states it.
         eps2d: Stated blur; None for the default.
     """
+    warnings: tuple[tuple[str, str], ...] = ()
     if mode not in ("classic", "antialiased", "2dgs"):
-        warnings = (*warnings, ("classic", f"{reason} is unknown"))
-        mode = "classic"
-    if mode == "2dgs":
+        warnings, mode = (("classic", f"{reason} is unknown"),), "classic"
+    elif mode == "2dgs":
         flat = "projected Gaussians of 2D Gaussian Splatting are approximated; its trainer intersects them with rays"
-        warnings = (*warnings, ("as Gaussians without thickness", f"{reason}; {flat}"))
+        warnings = (("as Gaussians without thickness", f"{reason}; {flat}"),)
     return RenderTag(Rendering(mode, eps2d or EPS2D), reason, warnings)  # type: ignore[arg-type]
 
 
@@ -262,78 +272,12 @@ def truncated(path: Path, declared: str) -> SceneError:
     return SceneError(f"{path}: {declared}: the file is truncated or its header is wrong. Copy or export it again.")
 
 
-def number_of(count: int, unit: str) -> str:
-    """Return a number with its unit, such as "1 byte"."""
-    return f"{count} {unit}" + "s" * (count != 1)
-
-
-def about_surplus(count: int, unit: str) -> tuple[str, ...]:
-    """Return the note on content that a header does not declare, such as 12 bytes; nothing if there is none."""
-    note = (
-        f"the file has {number_of(count, unit)} more than its header declares, which are not read; copy or export it "
-        "again"
-    )
-    return (note,) if count else ()
-
-
-def without_padding(data: bytes) -> bytes:
-    """Return bytes after the data of a scene; nothing if they mean nothing."""
-    return data if len(data) > _MAX_PADDING or data.strip(_PADDING) else b""
-
-
-def about_part(path: Path, start: int, end: int) -> tuple[str, ...]:
-    """Return the note on a part of a file that its header does not declare; nothing if there is only padding.
-
-    Args:
-        start: Byte offset of the part.
-        end: Byte offset of its end.
-    """
-    if start >= end or not without_padding(read_bytes(path, start, min(end, start + _MAX_PADDING + 1))):
-        return ()
-    return about_surplus(end - start, "byte")
-
-
-def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: int, end: int) -> None:
-    """Raise a SceneError if a binary file looks as if a transfer as text made it longer than declared.
-
-    Args:
-        header_bytes: Size of its header.
-        newline: Line end of its header.
-        start: Byte offset of the end of the declared data.
-        end: Size of the file.
-    """
-    if start >= end:
-        return
-    data = read_bytes(path, header_bytes, min(start, header_bytes + _SAMPLE_BYTES))
-    line_ends = data.count(b"\n")
-    changed = newline == b"\r\n" or (line_ends == data.count(b"\r\n") and line_ends >= _MIN_LINE_ENDS)
-    blank = not read_bytes(path, start, min(end, start + _MAX_PADDING)).strip(_BLANKS)
-    if (changed and not blank) or _is_utf8(data):
-        raise SceneError(
-            f"{path}: has {number_of(end - start, 'byte')} more than its header declares. Was it transferred as text, "
-            "which changes line ends and other bytes? Copy it again in binary mode."
-        )
-
-
-def _is_utf8(data: bytes) -> bool:
-    """Return whether data is UTF-8 beyond ASCII, which binary numbers never are; its end may cut off a character."""
-    try:
-        return not codecs.getincrementaldecoder("utf-8")().decode(data).isascii()
-    except UnicodeDecodeError:
-        return False
-
-
 #: Fraction of values outside their range, above which they have other units.
 _MAX_OUTSIDE = 0.2
-#: Number of Gaussians below which values in an unusual range say nothing, and maximum number that is sampled.
-_MIN_GAUSSIANS, _SAMPLE = 16, 100_000
+#: Number of Gaussians below which values in an unusual range say nothing.
+_MIN_GAUSSIANS = 16
 #: SH coefficient of degree 0 above which colors are not those of 3DGS: eight times as bright as white.
 _LARGEST_COLOR = 26.0
-#: Range of the largest logit that is doubtful if none is negative: more than trainers reach, at most a byte.
-_DOUBTFUL_LOGITS = (40.0, 255.0)
-#: Ends of the range that coefficients fill if they are colors of 0 to 1.
-_COLOR_ENDS = (0.1, 0.9)
-_HINT = "Export the scene again with logarithms of scales and logits of opacities, as 3DGS trainers write them."
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # invalid values are reported later
@@ -368,75 +312,34 @@ def logits(path: Path, opacities: NDArray[np.float64]) -> NDArray[np.float64]:
     return result
 
 
-def check_units(path: Path, arrays: Arrays, flat: float, *, logits_stored: bool) -> tuple[str, ...]:
-    """Check that values are logarithms, logits and SH coefficients, and return notes on doubtful ones.
+@np.errstate(invalid="ignore")
+def check_units(path: Path, arrays: Arrays, *, logits_stored: bool) -> None:
+    """Check that values are logits and SH coefficients. Values that are not numbers are ignored.
 
     Args:
-        arrays: Arrays of the scene, whose invalid Gaussians are ignored.
-        flat: Log scale of axes that the file does not have.
+        arrays: Arrays of the scene.
         logits_stored: Whether the format stores logits. Opacities of others may be in any part of 0..1.
 
     Raises:
-        SceneError: If scales, opacities or colors were stored as they are.
+        SceneError: If opacities or colors were stored as they are.
     """
     if len(arrays["means"]) < _MIN_GAUSSIANS:
-        return ()
-    scales, opacities, colors = (_range(arrays[name]) for name in ("scales", "opacities", "sh_dc"))
-    axes = arrays["scales"][:, [axis for axis in range(3) if arrays["scales"][:1, axis] != flat]]
-    scales = _range(axes) if axes.shape[1] else scales
-    activated = opacities[0] >= 0 and 0 < opacities[1] <= 1
-    large = scales[0] >= 0 and scales[1] > 0
-    if large and (activated or _fits_as_deviations(arrays["means"], axes)):
-        also = f", and its opacities from {opacities[0]:.3g} to {opacities[1]:.3g}" if activated else ""
+        return
+    (least, most), (darkest, brightest) = (
+        (float(np.fmin.reduce(arrays[name], axis=None)), float(np.fmax.reduce(arrays[name], axis=None)))
+        for name in ("opacities", "sh_dc")
+    )
+    if logits_stored and least >= 0 and 0 < most <= 1:
         raise SceneError(
-            f"{path}: its log scales go from {scales[0]:.3g} to {scales[1]:.3g}{also}: they seem to be stored as they "
-            f"are (activated). {_HINT}"
+            f"{path}: its logits of opacities go from {least:.3g} to {most:.3g}: they seem to be opacities "
+            "(activated). Export the scene again with logarithms of scales and logits of opacities, as 3DGS trainers "
+            "write them."
         )
-    if activated and logits_stored:
+    if darkest >= 0 and brightest > _LARGEST_COLOR:
         raise SceneError(
-            f"{path}: its logits of opacities go from {opacities[0]:.3g} to {opacities[1]:.3g}: they seem to be "
-            f"opacities (activated). {_HINT}"
-        )
-    if colors[0] >= 0 and colors[1] > _LARGEST_COLOR:
-        raise SceneError(
-            f"{path}: its colors (f_dc) go from {colors[0]:.3g} to {colors[1]:.3g}: they seem to be colors of 0 to "
+            f"{path}: its colors (f_dc) go from {darkest:.3g} to {brightest:.3g}: they seem to be colors of 0 to "
             "255, not SH coefficients. Export the scene again with (color / 255 - 0.5) / 0.2821."
         )
-    notes = []
-    if opacities[0] >= 0 and _DOUBTFUL_LOGITS[0] < opacities[1] <= _DOUBTFUL_LOGITS[1]:
-        notes.append(
-            f"logits of opacities go from {opacities[0]:.3g} to {opacities[1]:.3g}, which is opaque; if they are "
-            "opacities of 0 to 100 or 255, export the scene again with logits"
-        )
-    if 0 <= colors[0] < _COLOR_ENDS[0] and _COLOR_ENDS[1] < colors[1] <= 1:
-        notes.append(
-            f"colors (f_dc) go from {colors[0]:.3g} to {colors[1]:.3g}, which is gray to light; if they are colors of "
-            "0 to 1, export the scene again with (color - 0.5) / 0.2821"
-        )
-    return tuple(notes)
-
-
-@np.errstate(invalid="ignore")
-def _range(values: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the smallest and the largest of values that are not NaN."""
-    return float(np.fmin.reduce(values, axis=None)), float(np.fmax.reduce(values, axis=None))
-
-
-def _fits_as_deviations(means: NDArray[np.float32], scales: NDArray[np.float32]) -> bool:
-    """Return whether sizes fit the distance between neighbors better as they are than as logarithms.
-
-    Args:
-        means: Positions [N, 3].
-        scales: Scales [N, axes], at least 0.
-    """
-    step = -(-len(means) // _SAMPLE)
-    low, high = np.nanquantile(means[::step], (0.05, 0.95), axis=0)
-    extent = float((high - low).max())
-    size = float(np.nanmedian(scales[::step].max(axis=1)))
-    if not 0 < size < extent:
-        return False
-    distance = np.log(extent / np.sqrt(len(means)))
-    return bool(abs(np.log(size) - distance) < abs(size - distance))
 
 
 #: Opacities of exactly 0 and 1 have no finite logit, so they are read as 0.25/255 and 1 - 0.25/255. The difference is

@@ -49,7 +49,6 @@ from sgsst_core.files.formats.scene_format import (
     OpenScene,
     SceneFormat,
     SceneHeader,
-    about_surplus,
     along_curve,
     blocks,
     extras_of,
@@ -61,7 +60,6 @@ from sgsst_core.files.formats.scene_format import (
     whole_number,
     with_largest,
     without_largest,
-    without_padding,
 )
 from sgsst_core.scene.rendering import Rendering
 
@@ -74,11 +72,8 @@ _MAX_COMMENT_BYTES = 1 << 16
 _MAX_LIST_BYTES = 1 << 21
 
 
-def archive_end(path: Path) -> tuple[bytes, tuple[str, ...]]:
-    """Read the end of an archive, before its list of files is parsed.
-
-    Returns:
-        List of files, not parsed, and the note on bytes before or after the archive.
+def archive_list(path: Path) -> bytes:
+    """Return the list of an archive's files, not parsed.
 
     Raises:
         SceneError: If it is truncated, larger than 4 GB, or lists too many files.
@@ -90,16 +85,13 @@ def archive_end(path: Path) -> tuple[bytes, tuple[str, ...]]:
         position = tail.rfind(_END_MAGIC)
         if position < 0 or position + _END.size > len(tail):
             raise SceneError(f"{path}: is a truncated ZIP archive. Copy or export the scene again.")
-        entries, list_bytes, list_offset, comment_bytes = _END.unpack_from(tail, position)[4:]
+        entries, list_bytes = _END.unpack_from(tail, position)[4:6]
         if tail[max(0, position - _LOCATOR_BYTES) : position].startswith(_LOCATOR_MAGIC):
             raise SceneError(f"{path}: is a ZIP archive of more than 4 GB, which cannot be read. Unpack it first.")
         if list_bytes > _MAX_LIST_BYTES:
             raise SceneError(f"{path}: is a ZIP archive of {entries} files, so no SOG scene. Unpack it first.")
-        list_start = size - len(tail) + position - list_bytes
-        file.seek(max(0, list_start))
-        names = file.read(list_bytes)
-    after = without_padding(tail[position + _END.size + comment_bytes :])
-    return names, about_surplus(max(0, list_start - list_offset) + len(after), "byte")
+        file.seek(max(0, size - len(tail) + position - list_bytes))
+        return file.read(list_bytes)
 
 
 #: Number of values of a codebook, one per byte.
@@ -324,17 +316,14 @@ class SogFiles:
         path: Path of the archive, or of a file in the folder.
         archive: Open archive; None for a folder.
         folder: Prefix of all names, such as "0_0/".
-        surplus: Note on bytes before or after the archive.
     """
 
-    def __init__(
-        self, path: Path, archive: zipfile.ZipFile | None = None, folder: str = "", surplus: tuple[str, ...] = ()
-    ) -> None:
-        self.path, self.archive, self.folder, self.surplus = path, archive, folder, surplus
+    def __init__(self, path: Path, archive: zipfile.ZipFile | None = None, folder: str = "") -> None:
+        self.path, self.archive, self.folder = path, archive, folder
 
     def part(self, folder: str) -> SogFiles:
         """Return the files with a further prefix."""
-        return SogFiles(self.path, self.archive, self.folder + folder, self.surplus)
+        return SogFiles(self.path, self.archive, self.folder + folder)
 
     def size(self, name: str) -> int:
         """Return an upper bound for the bytes of a file: its size, or that of the archive, whose list may be wrong."""
@@ -435,13 +424,13 @@ def _opened(path: Path) -> Iterator[SogFiles]:
     if read_bytes(path, 0, 4) != ZIP_MAGIC:
         yield SogFiles(path)
         return
-    _, surplus = archive_end(path)
+    archive_list(path)
     try:
         archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
         raise SceneError(f"{path}: is a damaged ZIP archive: {error}. Copy or export the scene again.") from error
     with archive:
-        yield SogFiles(path, archive, surplus=surplus)
+        yield SogFiles(path, archive)
 
 
 def _read_header(start: FileStart) -> SogHeader:
@@ -505,7 +494,7 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
     notes = (f"{', '.join(sorted(more))[:80]} of meta.json are unknown and left out",) if more else ()
     return SogHeader(
         *(SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics, vectors),
-        notes=(*files.surplus, *notes),
+        notes=notes,
         tag=tag,
     )
 
@@ -689,13 +678,7 @@ def _webp(pixels: NDArray[np.uint8], width: int) -> bytes:
     return file.getvalue()
 
 
-def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the distance between positions that can be stored at each Gaussian, [n]."""
-    low, high = _encoded_positions(means)[1]
-    return np.max((high - low) / 65535 * (1 + np.abs(means)), axis=1)  # type: ignore[no-any-return]
-
-
-SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write, step=_step)
+SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write)
 
 
 #: Name of the index in a folder or an archive.
@@ -738,7 +721,7 @@ def _matches_streamed(start: FileStart) -> bool:
     if known_kind(start.path, start.head, SCENES):
         return False
     try:
-        return INDEX_NAME.encode() in archive_end(start.path)[0]
+        return INDEX_NAME.encode() in archive_list(start.path)
     except SceneError:  # raised again by the reader of SOG
         return False
 
@@ -767,7 +750,7 @@ def _read_streamed_header(start: FileStart) -> StreamedHeader:
         max(part.coefficients for part in scene.values()),
         scene | parts,
         {folder: slice(*span) for folder, span in zip(scene, pairwise(ends), strict=True)},
-        notes=files.surplus + (notes if len(levels) > 1 else ()),
+        notes=notes if len(levels) > 1 else (),
         tag=next(iter(scene.values())).tag,
     )
 

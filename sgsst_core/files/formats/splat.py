@@ -30,7 +30,6 @@ from sgsst_core.files.formats.scene_format import (
     OpenScene,
     SceneFormat,
     SceneHeader,
-    about_part,
     logarithms,
     read_bytes,
     read_rows,
@@ -163,8 +162,7 @@ def _read_ksplat_header(start: FileStart) -> KsplatHeader:
             f"{sum(section['count'] for section in read)}: it was not written completely. Export it again."
         )
     coefficients = COEFFICIENTS[max(section["degree"] for section in read)]
-    notes = about_part(path, position, start.size)
-    return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read, notes=notes)
+    return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read)
 
 
 def _row(level: int, degree: int) -> np.dtype:

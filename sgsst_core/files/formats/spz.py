@@ -44,12 +44,9 @@ from sgsst_core.files.formats.scene_format import (
     RenderTag,
     SceneFormat,
     SceneHeader,
-    about_part,
-    about_surplus,
     blocks,
     harmonics_matrix,
     join_bits,
-    number_of,
     opacity_bytes,
     read_bytes,
     read_rows,
@@ -57,7 +54,6 @@ from sgsst_core.files.formats.scene_format import (
     truncated,
     with_largest,
     without_largest,
-    without_padding,
 )
 from sgsst_core.scene.rendering import Rendering
 
@@ -92,8 +88,6 @@ _ANTIALIASED, _HAS_EXTENSIONS, _LEVELS = 1, 2, 0x80
 _USUAL_BITS = 12
 _ENDS_EARLY = "the data ends before all Gaussians that the header declares"
 _ASSUMED_AXES = "axes: read as rub; the file states none. If the scene is upside down, pass --spz-axes rdf"
-#: Maximum number of unknown extensions that a note names.
-_NOTED_EXTENSIONS = 8
 
 _SCALES = (np.arange(256) / 16 - 10).astype(np.float32)
 #: SH coefficient of degree 0 for each byte. Their range exceeds that of colors in 0..1.
@@ -188,7 +182,7 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
         declared = f"the SPZ header declares {number} streams with their table at byte {table}"
         raise truncated(path, f"{declared}; expected {len(expected)} streams in {size} bytes")
     records = read_bytes(path, 32, min(table, 32 + _EXTENSION_BYTES))
-    axes, notes, _ = _parsed_extensions(path, records, header)
+    axes, _ = _parsed_extensions(path, records, header)
     position = table + 16 * number
     streams, listed = [], list(struct.iter_unpack("<QQ", read_bytes(path, table, position)))
     for (compressed, decompressed), wanted in zip(listed, expected, strict=True):
@@ -198,8 +192,7 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
             raise truncated(path, f"{declared}; {needed}")
         streams.append((position, compressed))
         position += compressed
-    notes = (*header.notes, *notes, *about_part(path, position, size))
-    return replace(header, streams=tuple(streams), stated_axes=axes, notes=notes, tag=_tag(head[14], header))
+    return replace(header, streams=tuple(streams), stated_axes=axes, tag=_tag(head[14], header))
 
 
 def _tag(flags: int, header: SpzHeader) -> RenderTag:
@@ -215,22 +208,19 @@ def _tag(flags: int, header: SpzHeader) -> RenderTag:
     return RenderTag(warnings=(("classic", reason),))
 
 
-def _parsed_extensions(path: Path, data: bytes, spz: SpzHeader) -> tuple[str | None, tuple[str, ...], int]:
+def _parsed_extensions(path: Path, data: bytes, spz: SpzHeader) -> tuple[str | None, bytes]:
     """Parse extension records: type (uint32), length in bytes (uint32) and content.
 
     Returns:
-        Stated axes, None if there are none; notes on SH bands, extensions and bytes that are not read; and the number
-        of bytes in place of records, or after them.
+        Stated axes, None if there are none, and what stands in place of records, or after them.
     """
-    axes, unknown, position = None, set[int](), 0
+    axes, position = None, 0
     while spz.extended and position + 8 <= len(data):
         kind, length = struct.unpack_from("<II", data, position)
         if position + 8 + length > len(data):
             break
         position += 8 + length
-        if kind != _AXES_EXTENSION:
-            unknown.add(kind)
-        elif axes is None and length >= 4:
+        if kind == _AXES_EXTENSION and axes is None and length >= 4:
             (number,) = struct.unpack_from("<I", data, position - length)
             if number >= len(_AXES):
                 raise SceneError(
@@ -238,12 +228,7 @@ def _parsed_extensions(path: Path, data: bytes, spz: SpzHeader) -> tuple[str | N
                     "Export it with one of these."
                 )
             axes = _AXES[number]
-    rest = len(without_padding(data[position:]))
-    notes = ["SH bands above degree 3 are left out"] if spz.degree > 3 else []
-    if unknown:
-        names = ", ".join(f"{kind:#x}" for kind in sorted(unknown)[:_NOTED_EXTENSIONS])
-        notes.append(f"SPZ extensions {names} are unknown and left out")
-    return axes, (*notes, *about_surplus(rest, "byte")), rest
+    return axes, data[position:]
 
 
 def _shared_fields(start: FileStart, head: bytes, least: int, versions: tuple[int, ...]) -> SpzHeader:
@@ -279,8 +264,7 @@ def _shared_fields(start: FileStart, head: bytes, least: int, versions: tuple[in
         3 * STORED_COEFFICIENTS[degree] * count,
     )
     drawn, extended = COEFFICIENTS[min(degree, 3)], bool(head[14] & _HAS_EXTENSIONS)
-    unknown = head[14] & ~(_ANTIALIASED | _HAS_EXTENSIONS)
-    notes = (f"the flags {unknown:#x} of the SPZ header are unknown and ignored",) if unknown else ()
+    notes = ("SH bands above degree 3 are left out",) if degree > 3 else ()
     return SpzHeader(
         *(SPZ, count, drawn, start.size, start.offset, version, degree, fractional_bits, sections),
         extended=extended,
@@ -318,8 +302,7 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> SpzHeader:
     next(takes, None)  # reach the end of the last stream, where its checksum is verified
     axes, notes = spz.stated_axes, spz.notes
     if not spz.streams:
-        axes, more, end = _extensions(path, stream, spz)
-        notes += (*more, *about_part(path, end, spz.offset + spz.size))
+        axes = _extensions(path, stream, spz)
     if spz.requested != "auto":
         axes = spz.requested
     elif axes is None:
@@ -400,17 +383,17 @@ class _Stream:
         return bytes(content)
 
 
-def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[str | None, tuple[str, ...], int]:
-    """Return the axes and notes on what follows the sections of version 1 to 3, and the offset of the stream's end."""
+def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> str | None:
+    """Return the axes that a file of version 1 to 3 states after its sections; None if it does not."""
     content = _taken(path, stream.read, _EXTENSION_BYTES, least=0)
     if _taken(path, stream.read, 1, least=0):
         raise _too_much(path)
     if stream.inflate and not stream.inflate.eof:
         raise truncated(path, _ENDS_EARLY)
-    axes, notes, rest = _parsed_extensions(path, content, spz)
-    if rest >= sum(spz.sections) // spz.count:
-        raise _too_much(path, f" by {number_of(rest, 'byte')}")
-    return axes, notes, stream.source.position - len(stream.inflate.unused_data if stream.inflate else b"")
+    axes, rest = _parsed_extensions(path, content, spz)
+    if len(rest.strip(b"\0")) >= sum(spz.sections) // spz.count:
+        raise _too_much(path)
+    return axes
 
 
 def _sections_of_streams(path: Path, file: OpenScene, spz: SpzHeader) -> Iterator[Take]:
@@ -436,9 +419,9 @@ def _taken(path: Path, read: Take, count: int, least: int | None = None) -> byte
     return content
 
 
-def _too_much(path: Path, surplus: str = "") -> SceneError:
+def _too_much(path: Path) -> SceneError:
     return SceneError(
-        f"{path}: the data continues{surplus} after all Gaussians that the header declares: the header is wrong. "
+        f"{path}: the data continues after all Gaussians that the header declares: the header is wrong. "
         "Export it again."
     )
 
@@ -557,7 +540,6 @@ def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
 SPZ = SceneFormat(
     *("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write),
     ranges={"scales": (_SCALES[0], _SCALES[-1]), "sh_dc": (_COLORS[0], _COLORS[-1]), "sh_rest": (-1.0, 1.0)},
-    step=lambda means: np.ldexp(1.0, -_fractional_bits(means)),
     has_axes=True,
 )
 SPZ_3 = replace(

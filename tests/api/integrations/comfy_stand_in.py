@@ -12,7 +12,6 @@ import torch
 
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import held
 
 
 class InterruptProcessingException(Exception):  # noqa: N818 (ComfyUI's name)
@@ -77,7 +76,7 @@ class NodeOutput:
 
 
 def splat_of(scene: Scene) -> SPLAT:
-    sh = torch.cat([scene.sh_dc[:, None], held(scene.sh_rest)], dim=1)
+    sh = torch.cat([scene.sh_dc[:, None], scene.sh_rest], dim=1)
     parts = (scene.means, scene.scales.exp(), scene.quats, scene.opacities.sigmoid()[:, None], sh)
     return SPLAT(*(part[None] for part in parts))
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import held
 
 
 class PanelSpace(enum.Enum):
@@ -50,7 +49,7 @@ class Splat:
         self.num_points = len(scene)
         self.means_raw, self.scaling_raw = Tensor(scene.means.numpy()), Tensor(scene.scales.numpy())
         self.rotation_raw, self.opacity_raw = Tensor(scene.quats.numpy()), Tensor(scene.opacities.numpy()[:, None])
-        self.sh0_raw, self.shN_raw = Tensor(scene.sh_dc.numpy()[:, None].copy()), Tensor(held(scene.sh_rest).numpy())
+        self.sh0_raw, self.shN_raw = Tensor(scene.sh_dc.numpy()[:, None].copy()), Tensor(scene.sh_rest.numpy())
 
 
 class Studio:

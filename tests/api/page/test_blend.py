@@ -11,8 +11,7 @@ from PIL import Image
 
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.library import save
-from sgsst_core.files.scene_file import read_scene
-from sgsst_core.files.stylized_ply import blend_scenes, write_colors, write_stylized
+from sgsst_core.files.scene_file import blend_scenes, read_scene, write_colors, write_stylized
 from sgsst_core.scene.camera import resized
 from tests.api.page.actions import Visit, done, result_of, submit
 from tests.api.page.browser import Watched, decoded, psnr, rendered

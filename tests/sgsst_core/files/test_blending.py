@@ -11,10 +11,8 @@ import torch
 from sgsst_core.errors import SceneError, SettingsError
 from sgsst_core.files.formats import scene_format
 from sgsst_core.files.library import save
-from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
-from sgsst_core.files.stylized_ply import blend_scenes, normalized
+from sgsst_core.files.scene_file import SceneFile, blend_scenes, normalized, read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.splat_scenes import cloud
 
 
@@ -43,7 +41,7 @@ def test_blend_is_the_weighted_mean(
     expected = np.einsum("s,snc->nc", fractions, colors)
     spacing = np.spacing(np.abs(expected).astype(np.float32))
     assert (np.abs(blend.scene.sh_dc.numpy() - expected) <= spacing).all()
-    assert torch.equal(held(blend.scene.sh_rest), held(files[0].scene.sh_rest))
+    assert torch.equal(blend.scene.sh_rest, files[0].scene.sh_rest)
 
 
 def test_blend_of_one_scene_is_bit_identical(tmp_path: Path) -> None:
@@ -55,15 +53,13 @@ def test_blend_of_one_scene_is_bit_identical(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("attenuation", [0.4, 1.0])
-@pytest.mark.parametrize("stored", [False, True])
-def test_attenuated_harmonics_are_blended(tmp_path: Path, attenuation: float, stored: bool) -> None:
+def test_attenuated_harmonics_are_blended(tmp_path: Path, attenuation: float) -> None:
     scene = cloud(60, degree=2)
-    paths = [file.path for file in written(tmp_path, scene, recolored(scene, 1, attenuation))]
-    files = [read_scene(path, held_bytes=0 if stored else None) for path in paths]
+    files = written(tmp_path, scene, recolored(scene, 1, attenuation))
     save(tmp_path / "blend.ply", blend_scenes(files, [-0.5, 1.5]))
     blend = read_scene(tmp_path / "blend.ply").scene
-    expected = held(scene.sh_rest).double() * (1 - 1.5 * attenuation)
-    assert torch.allclose(held(blend.sh_rest).double(), expected, rtol=1e-5, atol=1e-6)
+    expected = scene.sh_rest.double() * (1 - 1.5 * attenuation)
+    assert torch.allclose(blend.sh_rest.double(), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_extreme_colors_stay_finite(tmp_path: Path) -> None:

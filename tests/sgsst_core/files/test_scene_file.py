@@ -18,17 +18,23 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files import stylized_ply
+from sgsst_core.files import scene_file
 from sgsst_core.files.formats import by_name, scene_format
 from sgsst_core.files.formats.spz import SPZ
-from sgsst_core.files.scene_file import USD_SUFFIXES, apply_filter, check_usd, read_scene, write_scene, write_usd
-from sgsst_core.files.stylized_ply import write_colors, write_stylized
+from sgsst_core.files.scene_file import (
+    USD_SUFFIXES,
+    apply_filter,
+    check_usd,
+    read_scene,
+    write_colors,
+    write_scene,
+    write_stylized,
+    write_usd,
+)
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.refine import Refinement, parents_of, piece_counts
-from sgsst_core.scene import stored_harmonics
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering
-from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.files.formats.samples import rewritten
 from tests.sgsst_core.splat_scenes import cloud
 from tests.small_scenes import cameras, wall
@@ -177,7 +183,7 @@ def test_only_colors_of_any_3dgs_ply_change(tmp_path_factory: pytest.TempPathFac
     for channel in range(3):
         for k in range(coefficients):
             column = f"f_rest_{channel * coefficients + k}"
-            assert held(scene.sh_rest)[:, k, channel].tolist() == [f32(row[column]) for row in rows]
+            assert scene.sh_rest[:, k, channel].tolist() == [f32(row[column]) for row in rows]
 
     colors = scene.sh_dc + torch.tensor([shift, 0.0, -shift])
     write_stylized(source, folder / "out.ply", colors)
@@ -199,7 +205,7 @@ def test_only_colors_of_any_3dgs_ply_change(tmp_path_factory: pytest.TempPathFac
 @pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("block", [1, 2, 1 << 16])
 def test_only_color_bytes_change(tmp_path: Path, form: str, block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (scene_format, stylized_ply):
+    for module in (scene_format, scene_file):
         monkeypatch.setattr(module, "BLOCK_ROWS", block)
     file = simple(5, degree=1, form=form)
     behind = b"bytes behind the last element \xff\r\n"
@@ -217,7 +223,7 @@ def test_only_color_bytes_change(tmp_path: Path, form: str, block: int, monkeypa
 def test_children_of_split_gaussians_inherit_all_properties(
     tmp_path: Path, form: str, dropped: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (scene_format, stylized_ply):
+    for module in (scene_format, scene_file):
         monkeypatch.setattr(module, "BLOCK_ROWS", 2)
     file = simple(5, degree=1, form=form)
     properties, rows = file.elements[0][1], file.elements[0][2]
@@ -394,7 +400,7 @@ GAUSSIAN = [f"property float {name}" for name in BASE]
         (header("element vertex 1", "property float x", "property double x"), r"vertex\.x twice"),
         (header("element a 1", "property int b", "element a 1", "property int b"), "'a' twice"),
         (header("element a 1000000000000000"), "'a' of the PLY header has no property"),
-        (header("element edge 0", "property list uchar int i"), "a PLY without vertices; missing: x, y, z, rot_0"),
+        (header("element edge 0", "property list uchar int i"), "not a 3DGS scene; missing: x, y, z, rot_0"),
         (header("element vertex 0", *GAUSSIAN), "holds no Gaussians"),
         (
             header("element vertex 1", *GAUSSIAN, "property list uchar int tags"),
@@ -414,16 +420,16 @@ GAUSSIAN = [f"property float {name}" for name in BASE]
         ),
         (
             header("element vertex 1", "property float x", "property float y", "property float z"),
-            "a point cloud .*missing: rot_0, .*f_dc_2, opacity",
+            "missing: rot_0, .*f_dc_2, opacity. .* a point cloud, train",
         ),
         (
             header("element vertex 1", "property float x", "element face 1", "property list uchar int i"),
-            "a mesh .*missing: y, z, rot_0",
+            "missing: y, z, rot_0",
         ),
         (header("element vertex 1", "property uint packed_position"), "a compressed PLY without element 'chunk'"),
         (
             header("element vertex 1", *(line for line in GAUSSIAN if "rot_2" not in line)),
-            "something else; missing: rot_2",
+            "missing: rot_2",
         ),
     ],
 )
@@ -494,8 +500,7 @@ ATTENUATIONS = (1e-9, 0.25, 0.7, 1.0)
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
-    for module in (scene_format, stylized_ply):
+    for module in (scene_format, scene_file):
         monkeypatch.setattr(module, "BLOCK_ROWS", 17)
 
 
@@ -523,11 +528,11 @@ def test_file_contains_the_attenuated_coefficients(tmp_path: Path, form: str, at
     colors = source.scene.sh_dc + 1
     write_stylized(source, tmp_path / "out.ply", colors, sh_attenuation=attenuation)
     loaded = read_scene(tmp_path / "out.ply").scene
-    rest = torch.zeros_like(held(loaded.sh_rest)) if attenuation == 1 else held(wanted.sh_rest)
-    assert torch.equal(held(loaded.sh_rest), rest)
+    rest = torch.zeros_like(loaded.sh_rest) if attenuation == 1 else wanted.sh_rest
+    assert torch.equal(loaded.sh_rest, rest)
     if attenuation == 1:
         assert wanted.sh_degree == 0
-        assert not torch.signbit(held(loaded.sh_rest)).any()
+        assert not torch.signbit(loaded.sh_rest).any()
     assert torch.equal(loaded.sh_dc, colors)
     for name in ("means", "quats", "scales", "opacities"):
         assert torch.equal(getattr(loaded, name), getattr(source.scene, name))
@@ -552,7 +557,7 @@ def test_compressed_scenes_are_attenuated_in_their_ply(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene.spz", cloud(60, degree=1), SPZ)
     source = read_scene(tmp_path / "scene.spz")
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.25)
-    assert torch.equal(held(read_scene(tmp_path / "out.ply").scene.sh_rest), held(source.scene.sh_rest) * 0.75)
+    assert torch.equal(read_scene(tmp_path / "out.ply").scene.sh_rest, source.scene.sh_rest * 0.75)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -708,7 +713,7 @@ def test_written_values_match_the_scene(tmp_path: Path, suffix: str, degree: int
     assert harmonics.shape == (300, (degree + 1) ** 2, 3)
     np.testing.assert_array_equal(harmonics[:, 0], scene.sh_dc.numpy())
     signs = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1])[: harmonics.shape[1] - 1, None]
-    np.testing.assert_array_equal(harmonics[:, 1:], held(scene.sh_rest).numpy() * signs)
+    np.testing.assert_array_equal(harmonics[:, 1:], scene.sh_rest.numpy() * signs)
     quats = scene.quats.double().numpy()
     w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
     for index, actual in enumerate(splats.GetOrientationsAttr().Get()):

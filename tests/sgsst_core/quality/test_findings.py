@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from plyfile import PlyData, PlyElement
 
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import TooManyIntersectionsError
@@ -116,22 +115,6 @@ def test_scene_far_from_origin_is_reported_with_its_resolution(tmp_path: Path) -
     scene = replace(wall(), means=wall().means + torch.tensor([1e6, 0.0, 0.0]))
     finding = finding_about(findings_in(tmp_path, scene), "far from its origin")
     assert "positions are 0.0625 apart" in finding.worst
-
-
-def test_positions_in_double_precision_that_float32_rounds_are_reported(tmp_path: Path) -> None:
-    path = tmp_path / "scene.ply"
-    write_scene(path, wall())
-    rows = PlyData.read(path)["vertex"].data
-    kinds = [(name, "<f8" if name in "xyz" else kind) for name, kind in rows.dtype.descr]
-    double = rows.astype(kinds)
-    PlyData([PlyElement.describe(double, "vertex")]).write(path)
-    assert not read_scene(path).notes
-    double["x"] += 5e5
-    double["y"] += 4.5e6
-    PlyData([PlyElement.describe(double, "vertex")]).write(path)
-    file = read_scene(path)
-    assert file.notes[0].startswith("positions are rounded to float32 by up to 0.25, ")
-    assert any("subtract an offset" in finding.done for finding in scene_findings(file))
 
 
 def test_unseen_and_hardly_seen_gaussians_follow_blend_weights(tmp_path: Path) -> None:

@@ -33,7 +33,6 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors
-from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import JobStyles
 from tests.sgsst_core.synthetic_images import synthetic_image
@@ -62,7 +61,7 @@ def plain(scene: Scene, sh_dc: Tensor, camera: Camera, style_image: Tensor) -> t
     """Compute a view's style distances on black and on white, and its other measures, in plain loops."""
     lpips = Lpips(dtype=torch.float64)
     rasterizer = ReferenceRasterizer(scene)
-    rest = reference_rest_colors(held(scene.sh_rest), scene.means, camera, scene.sh_degree).double()
+    rest = reference_rest_colors(scene.sh_rest, scene.means, camera, scene.sh_degree).double()
     coverage = rasterizer.coverage(camera).double()
     styles, palettes, contents, similarities = [], [], [], []
     for behind in (0.0, 1.0):

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from torch import Tensor
 
 from sgsst_core import refine as module
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.survey import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -40,7 +38,6 @@ from sgsst_core.refine import (
 from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.colors import luminance
 from sgsst_core.scene.gaussians import TENSORS, Scene, unit_rotations
-from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from sgsst_core.settings import Settings, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing import refining
@@ -375,16 +372,6 @@ def test_split_gaussian_looks_like_its_parent(opacity: float, least: float) -> N
         images.append(ReferenceRasterizer(each).render(torch.ones(len(each), 3), camera()))
     error = float((images[0] - images[1]).square().mean())
     assert -10 * math.log10(error) > least
-
-
-def test_children_inherit_stored_harmonics(tmp_path: Path) -> None:
-    write_scene(tmp_path / "scene.ply", cloud(300, degree=3))
-    pieces = torch.ones(300, 3, dtype=torch.uint8)
-    pieces[::7, 1] = 3
-    plain = split(read_scene(tmp_path / "scene.ply").scene, pieces)
-    stored = split(read_scene(tmp_path / "scene.ply", held_bytes=0).scene, pieces)
-    assert isinstance(stored.sh_rest, StoredHarmonics)
-    assert torch.equal(held(stored.sh_rest), held(plain.sh_rest))
 
 
 @settings(max_examples=60, deadline=None)

@@ -22,7 +22,6 @@ from sgsst_core.quality.measure import Float32Reference
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rendering import Rendering
-from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.sgsst_core.trainer_scenes import splats_of, write_gsplat, write_nerfstudio
 from tests.small_scenes import cameras, style, wall, write_files
@@ -66,7 +65,7 @@ def test_result_has_the_form_of_the_scene_and_new_colors(
 ) -> None:
     given = FORMS[form](wall(sh_degree=1), tmp_path)
     before = as_scene(given)
-    unchanged = Scene(*(held(getattr(before, name)).clone() for name in TENSORS))
+    unchanged = Scene(*(getattr(before, name).clone() for name in TENSORS))
     result = run(given, tiny_weights)
     assert type(result) is type(given)
     after, alone = as_scene(result), run(before, tiny_weights)
@@ -98,7 +97,7 @@ def test_split_and_attenuated_results_have_the_form_of_the_scene(
     assert len(after) > len(before)
     alone = run(before, tiny_weights, refine=2, sh_attenuation=0.25)
     for name in TENSORS:
-        actual, wanted = (held(getattr(each, name)) for each in (after, alone))
+        actual, wanted = (getattr(each, name) for each in (after, alone))
         tolerance = 1e-5 if form == "activated" else 0  # exp and log round
         torch.testing.assert_close(actual, wanted, rtol=tolerance, atol=tolerance)
     if isinstance(given, dict):
@@ -106,7 +105,7 @@ def test_split_and_attenuated_results_have_the_form_of_the_scene(
     else:
         save(tmp_path / "out.ply", result)
         saved = as_scene(load_scene(tmp_path / "out.ply"))
-        assert all(torch.equal(held(getattr(saved, name)), held(getattr(after, name))) for name in TENSORS)
+        assert all(torch.equal(getattr(saved, name), getattr(after, name)) for name in TENSORS)
 
 
 def test_readme_example_runs(tiny_installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,7 +201,7 @@ def make(weights: BackboneWeights, scene: Scene, **values: Any) -> Stylizer:
 def test_job_is_bit_identical_to_that_of_an_attenuated_scene(tiny_weights: BackboneWeights, attenuation: float) -> None:
     scene = wall(sh_degree=2)
     stylizer = make(tiny_weights, scene, sh_attenuation=attenuation)
-    came = replace(scene, sh_rest=held(scene.sh_rest) * torch.tensor(1 - attenuation, dtype=torch.float32))
+    came = replace(scene, sh_rest=scene.sh_rest * torch.tensor(1 - attenuation, dtype=torch.float32))
     other = make(tiny_weights, came.without_zero_bands())
     for each in (stylizer, other):
         run_job(each)
@@ -215,13 +214,10 @@ def test_job_is_bit_identical_to_that_of_an_attenuated_scene(tiny_weights: Backb
         assert exact[scale].total == pytest.approx(terms.total, rel=1e-6)
 
 
-@pytest.mark.parametrize(("held_bytes", "attenuation"), [(0, 0.4), (None, 1.0)])
-def test_written_result_renders_as_optimized(
-    tiny_weights: BackboneWeights, tmp_path: Path, held_bytes: int | None, attenuation: float
-) -> None:
+@pytest.mark.parametrize("attenuation", [0.4, 1.0])
+def test_written_result_renders_as_optimized(tiny_weights: BackboneWeights, tmp_path: Path, attenuation: float) -> None:
     write_scene(tmp_path / "scene.ply", wall(sh_degree=1))
-    source = read_scene(tmp_path / "scene.ply", held_bytes=held_bytes)
-    assert isinstance(source.scene.sh_rest, StoredHarmonics) == (held_bytes == 0)
+    source = read_scene(tmp_path / "scene.ply")
     settings = make_settings(steps_coarse=0, steps_sos=2, sh_attenuation=attenuation)
     values = settings.model_dump(exclude={"preset"})
     stylized = stylize(source, cameras(), style(), weights=tiny_weights, **values)

@@ -23,7 +23,6 @@ from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
 from sgsst_core.scene.gaussians import TENSORS, Scene
-from sgsst_core.scene.stored_harmonics import held
 from tests.small_scenes import wall
 
 #: Record of a .splat file.
@@ -127,7 +126,7 @@ def check_damage(path: Path, good: bytes, wrap: Callable[[bytes], bytes] = bytes
             scene = read_scene(path).scene
         except SceneError:
             continue
-        assert all(bool(torch.isfinite(held(getattr(scene, name))).all()) for name in TENSORS), trial
+        assert all(bool(torch.isfinite(getattr(scene, name)).all()) for name in TENSORS), trial
 
 
 def ksplat(scene: Scene, level: int, bucket_size: int = 256) -> bytes:
@@ -135,7 +134,7 @@ def ksplat(scene: Scene, level: int, bucket_size: int = 256) -> bytes:
 
     Positions of level 1 and 2 are steps within the largest extent of a bucket.
     """
-    count, coefficients = len(scene), held(scene.sh_rest).shape[1]
+    count, coefficients = len(scene), scene.sh_rest.shape[1]
     means = scene.means.double().numpy()
     full, rest = divmod(count, bucket_size)
     buckets = [means[start : start + bucket_size] for start in range(0, count, bucket_size)]
@@ -151,7 +150,7 @@ def ksplat(scene: Scene, level: int, bucket_size: int = 256) -> bytes:
     rows["rotation"] = scene.quats.numpy()
     rows["color"][:, :3] = ((0.5 + SH_C0 * scene.sh_dc.double()).clamp(0, 1) * 255).round().numpy()
     rows["color"][:, 3] = (scene.opacities.double().sigmoid() * 255).round().numpy()
-    harmonics = held(scene.sh_rest).double().numpy()
+    harmonics = scene.sh_rest.double().numpy()
     bands = [harmonics[:, first:last].transpose(0, 2, 1).reshape(count, -1) for first, last in ((0, 3), (3, 8))]
     values = np.concatenate(bands, axis=1)
     rows["harmonics"] = np.rint((values.clip(-1.5, 1.5) + 1.5) / 3 * 255) if level == 2 else values

@@ -15,7 +15,6 @@ from sgsst_core.files.formats.glb import GLB
 from sgsst_core.files.formats.spz import SPZ_3
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
-from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.files.formats.samples import assert_close, check_documents, encoded, refused
 from tests.sgsst_core.splat_scenes import camera, cloud
 
@@ -187,7 +186,7 @@ def test_all_sets_of_gaussians_become_one_scene(tmp_path: Path) -> None:
     torch.testing.assert_close(file.scene.means, y_up * torch.tensor([-1.0, -1, 1]))
     torch.testing.assert_close(file.scene.scales[:, 0].exp(), torch.tensor([1, 0.5, 1, 0.5, 2, 1, 2, 1]))
     assert file.scene.sh_degree == 1
-    rest = held(file.scene.sh_rest)
+    rest = file.scene.sh_rest
     assert not rest[:4].any()
     assert rest[4:].abs().sum() == 2 * 3 * (0.5 + 0.5 + 1 + 2)
 
@@ -233,7 +232,7 @@ def test_colors_for_other_programs_are_linear(tmp_path: Path) -> None:
 def test_linear_colors_become_srgb(tmp_path: Path) -> None:
     """Those of a Gaussian in any direction, as far as they are close to its color of degree 0."""
     scene = cloud(500, degree=1)
-    scene = replace(scene, sh_dc=scene.sh_dc.clamp(-1.5, 3), sh_rest=held(scene.sh_rest) * 1e-3)
+    scene = replace(scene, sh_dc=scene.sh_dc.clamp(-1.5, 3), sh_rest=scene.sh_rest * 1e-3)
     write_scene(tmp_path / "linear.glb", scene, GLB)
     document, data = split((tmp_path / "linear.glb").read_bytes())
     document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"] |= {

@@ -16,11 +16,9 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import COMPRESSED_PLY
-from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.files.stylized_ply import write_stylized
+from sgsst_core.files.scene_file import read_scene, write_scene, write_stylized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
-from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.files.formats.samples import assert_close, encoded, gsply_of, refused, scene_of
 from tests.sgsst_core.splat_scenes import cloud
 from tests.small_scenes import wall
@@ -32,7 +30,7 @@ def test_written_ply_is_bit_identical_to_plyfile(tmp_path: Path) -> None:
     write_scene(path, scene)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(24))]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    rest = held(scene.sh_rest).transpose(1, 2).reshape(300, 24)
+    rest = scene.sh_rest.transpose(1, 2).reshape(300, 24)
     parts = [scene.means, torch.zeros(300, 3), scene.sh_dc, rest, scene.opacities[:, None], scene.scales, scene.quats]
     values = torch.cat(parts, dim=1).numpy()
     rows = np.array([tuple(row) for row in values.tolist()], [(name, "<f4") for name in names])
@@ -44,7 +42,7 @@ def table(scene: Scene) -> dict[str, np.ndarray]:
     """Return the usual properties of a scene, float32, by name."""
     columns = dict(zip("xyz", scene.means.numpy().T, strict=True))
     columns |= {f"f_dc_{i}": values for i, values in enumerate(scene.sh_dc.numpy().T)}
-    rest = held(scene.sh_rest).transpose(1, 2).reshape(len(scene), -1).numpy()
+    rest = scene.sh_rest.transpose(1, 2).reshape(len(scene), -1).numpy()
     columns |= {f"f_rest_{i}": values for i, values in enumerate(rest.T)}
     columns["opacity"] = scene.opacities.numpy()
     columns |= {f"scale_{i}": values for i, values in enumerate(scene.scales.numpy().T)}
@@ -85,10 +83,10 @@ def test_isotropic_scales_are_read(tmp_path: Path, name: str) -> None:
     scene, path, out = cloud(200, degree=1), tmp_path / "scene.ply", tmp_path / "out.ply"
     columns = {key: values for key, values in table(scene).items() if "scale" not in key}
     save(path, columns | {name: scene.scales[:, 1].numpy()})
-    file = read_scene(path, held_bytes=0)
+    file = read_scene(path)
     assert torch.equal(file.scene.scales, scene.scales[:, 1:2].expand(-1, 3))
     assert file.scene.rendering == CLASSIC, "not flat"
-    assert torch.equal(held(file.scene.sh_rest), held(scene.sh_rest))
+    assert torch.equal(file.scene.sh_rest, scene.sh_rest)
     write_stylized(file, out, scene.sh_dc + 1)
     assert torch.equal(read_scene(out).scene.scales, file.scene.scales)
 
@@ -102,16 +100,15 @@ def test_two_of_three_scales_are_refused(tmp_path: Path) -> None:
         read_scene(tmp_path / "scene.ply")
 
 
-@pytest.mark.parametrize("stored", [False, True])
 @pytest.mark.parametrize("text", [False, True])
-def test_sh_degree_4_is_rendered_up_to_3_and_preserved(tmp_path: Path, text: bool, stored: bool) -> None:
+def test_sh_degree_4_is_rendered_up_to_3_and_preserved(tmp_path: Path, text: bool) -> None:
     scene, path, out = cloud(150, degree=3), tmp_path / "scene.ply", tmp_path / "out.ply"
     more = torch.randn(150, 9, 3, generator=torch.Generator().manual_seed(1))
-    whole = torch.cat([held(scene.sh_rest), more], dim=1)
+    whole = torch.cat([scene.sh_rest, more], dim=1)
     save(path, table(replace(scene, sh_rest=whole)), text)
-    file = read_scene(path, held_bytes=0 if stored else None)
-    assert (isinstance(file.scene.sh_rest, StoredHarmonics), file.scene.sh_degree) == (stored and not text, 3)
-    assert torch.equal(held(file.scene.sh_rest), held(scene.sh_rest))
+    file = read_scene(path)
+    assert file.scene.sh_degree == 3
+    assert torch.equal(file.scene.sh_rest, scene.sh_rest)
     assert file.notes == ("SH bands above degree 3 are not drawn; only a stylized PLY keeps them",)
     write_stylized(file, out, scene.sh_dc * 2, sh_attenuation=0.5)
     vertex = PlyData.read(str(out))["vertex"]
@@ -143,9 +140,9 @@ def test_gsply_files_are_read_as_by_gsply(tmp_path: Path, degree: int) -> None:
     # gsply places the first and last level of SH coefficients in the middle of their steps instead of at the ends.
     expected = scene_of(reference)
     assert_close(replace(actual.scene, sh_rest=expected.sh_rest), expected)
-    rest = held(expected.sh_rest)
+    rest = expected.sh_rest
     inner = rest.abs() < 3.98
-    torch.testing.assert_close(held(actual.scene.sh_rest)[inner], rest[inner], rtol=0, atol=1e-6)
+    torch.testing.assert_close(actual.scene.sh_rest[inner], rest[inner], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

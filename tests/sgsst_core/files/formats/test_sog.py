@@ -20,7 +20,6 @@ from sgsst_core.files.formats.sog import SOG, nearest_entries, pack, palette, va
 from sgsst_core.files.library import load_scene, save
 from sgsst_core.files.scene_file import read_scene, write_levels, write_scene
 from sgsst_core.scene.gaussians import TENSORS
-from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.files.formats.samples import (
     Files,
     archived,
@@ -97,7 +96,7 @@ def test_values_match_those_computed_by_hand(tmp_path: Path, version: int, metho
     half = 0.5**0.5
     expected = [[half, 0, 0, half], [-half, 0, half, 0]]
     torch.testing.assert_close(scene.quats, torch.tensor(expected), atol=0.01, rtol=0)
-    rest = held(scene.sh_rest)
+    rest = scene.sh_rest
     assert (rest[0].tolist(), rest[1].tolist()) == ([[-5] * 3] * 3, [[-4, -5, -5], [-3, -5, -5], [-2, -5, -5]])
     if version == 2:
         assert scene.opacities.sigmoid().tolist() == pytest.approx([0.25 / 255, 1 - 0.25 / 255], rel=1e-4)
@@ -140,8 +139,8 @@ def test_missing_first_value_of_a_codebook_is_extrapolated(tmp_path: Path) -> No
     values = torch.tensor([-4 - step, -4, -3])
     torch.testing.assert_close(scene.scales, torch.stack([values, values.flip(0)]))
     torch.testing.assert_close(scene.sh_dc[1], values)
-    expected = torch.where(held(complete.sh_rest) == -5, -4 - step, held(complete.sh_rest).double())
-    torch.testing.assert_close(held(scene.sh_rest), expected.float())
+    expected = torch.where(complete.sh_rest == -5, -4 - step, complete.sh_rest.double())
+    torch.testing.assert_close(scene.sh_rest, expected.float())
     meta["scales"]["codebook"][1] = None
     refused(tmp_path, zipped(files | {"meta.json": json.dumps(meta).encode()}), "NaN")
 
@@ -279,10 +278,10 @@ def test_finest_level_and_environment_are_read(tmp_path: Path, given: str) -> No
     parts = [part_of(files, name, tmp_path / "parts") for name in ("0_0", "0_1", "env")]
     for name in TENSORS[:-1]:
         assert torch.equal(getattr(file.scene, name), torch.cat([getattr(part, name) for part in parts])), name
-    rest = held(file.scene.sh_rest)
-    assert torch.equal(rest[:300, :3], held(parts[0].sh_rest))
+    rest = file.scene.sh_rest
+    assert torch.equal(rest[:300, :3], parts[0].sh_rest)
     assert not rest[:300, 3:].any()
-    assert torch.equal(rest[300:500], held(parts[1].sh_rest))
+    assert torch.equal(rest[300:500], parts[1].sh_rest)
     assert ["the finest of 3 levels" in note for note in file.notes] == [True]
 
 

@@ -11,7 +11,6 @@ import torch
 from sgsst_core.errors import SceneError
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.files.formats.samples import SPLAT_ROW, assert_close, check_damage, ksplat, refused
 from tests.sgsst_core.splat_scenes import cloud
 
@@ -47,7 +46,7 @@ def test_random_damage_never_crashes_the_reader_of_splat(tmp_path: Path) -> None
 def scene(degree: int = 2, count: int = 700) -> Scene:
     """Return a scene whose values have the range of the format."""
     expected = cloud(count, degree=degree)
-    return replace(expected, sh_dc=expected.sh_dc.clamp(-1.7, 1.7), sh_rest=held(expected.sh_rest).clamp(-1.4, 1.4))
+    return replace(expected, sh_dc=expected.sh_dc.clamp(-1.7, 1.7), sh_rest=expected.sh_rest.clamp(-1.4, 1.4))
 
 
 def read(tmp_path: Path, data: bytes) -> Scene:
@@ -67,7 +66,7 @@ def test_all_compression_levels_are_read(tmp_path: Path, level: int, degree: int
     assert float((actual.sh_dc - expected.sh_dc).abs().max()) <= 0.5 / 255 / 0.282 * 1.01
     assert float((actual.opacities.sigmoid() - expected.opacities.sigmoid()).abs().max()) < 0.51 / 255
     if level == 2 and degree:
-        assert float((held(actual.sh_rest) - held(expected.sh_rest)).abs().max()) <= 1.5 / 255 * 1.01
+        assert float((actual.sh_rest - expected.sh_rest).abs().max()) <= 1.5 / 255 * 1.01
         colors = replace(colors, sh_rest=expected.sh_rest)
     assert_close(colors, expected, others=1e-3 if level else 1e-6)
 
@@ -98,7 +97,7 @@ def test_sections_of_different_sh_degree_are_read(tmp_path: Path) -> None:
     data = bytes(head) + one[4096:5120] + empty + other[4096:5120] + one[5120:] + other[5120:]
     actual = read(tmp_path, data)
     assert (len(actual), actual.sh_degree) == (500, 2)
-    assert not held(actual.sh_rest)[300:].any()
+    assert not actual.sh_rest[300:].any()
     expected = torch.cat([read(tmp_path, each).means for each in (one, other)])
     assert torch.equal(actual.means, expected)
 

@@ -21,7 +21,6 @@ from sgsst_core.files.library import load_scene, save
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import basis
-from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.files.formats.samples import (
     assert_close,
     check_damage,
@@ -46,7 +45,7 @@ def rotated(scene: Scene) -> Scene:
         torch.randn(200, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), dim=1
     )
     degree = scene.sh_degree
-    rest = held(scene.sh_rest)
+    rest = scene.sh_rest
     if degree:
         seen = basis(directions, degree)
         there = basis(directions @ turn, degree)
@@ -110,7 +109,7 @@ def test_stated_axes_are_followed_unless_others_are_requested(tmp_path: Path, ve
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_unknown_extensions_are_noted(tmp_path: Path, version: int) -> None:
+def test_unknown_extensions_are_left_out(tmp_path: Path, version: int) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700)), version=version)
     data = path.read_bytes()
@@ -120,10 +119,7 @@ def test_unknown_extensions_are_noted(tmp_path: Path, version: int) -> None:
     assert not read_scene(path, spz_axes="rdf").notes
     records = axes_record(6) + struct.pack("<II", 0xADBE0002, 3) + b"abc" + struct.pack("<II", 7, 0)
     path.write_bytes(with_records(data, records + struct.pack("<II", 9, 1000)))
-    assert read_scene(path).notes == (
-        "SPZ extensions 0x7, 0xadbe0002 are unknown and left out",
-        "the file has 8 bytes more than its header declares, which are not read; copy or export it again",
-    )
+    assert read_scene(path).notes == ()
 
 
 @pytest.mark.parametrize("version", [3, 4])
@@ -148,7 +144,7 @@ def test_all_axes_are_read_and_written_back(tmp_path: Path, number: int) -> None
     """A function of the direction d is the same in other axes, whose matrix may mirror."""
     first, again = tmp_path / "first", tmp_path / "again"
     name, scene = SYSTEMS[number - 1].lower(), cloud(700, degree=3)
-    scene = replace(scene, sh_dc=scene.sh_dc.clamp(-3, 3), sh_rest=held(scene.sh_rest).clamp(-0.5, 0.5))
+    scene = replace(scene, sh_dc=scene.sh_dc.clamp(-3, 3), sh_rest=scene.sh_rest.clamp(-0.5, 0.5))
     write_scene(first, scene, SPZ, name)
     assert first.read_bytes()[32:44] == axes_record(number)
     loaded = read_scene(first)
@@ -166,7 +162,7 @@ def test_all_axes_are_read_and_written_back(tmp_path: Path, number: int) -> None
     torch.testing.assert_close(matrix @ covariances[0] @ matrix.T, covariances[1], rtol=1e-3, atol=1e-6)
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=1)
     seen, there = (basis(each, 3) for each in (directions, directions @ matrix.double()))
-    stored, read = (held(each.sh_rest).double() for each in (as_stored, loaded.scene))
+    stored, read = (each.sh_rest.double() for each in (as_stored, loaded.scene))
     torch.testing.assert_close(
         torch.einsum("dk,nkc->ndc", there, stored), torch.einsum("dk,nkc->ndc", seen, read), rtol=1e-4, atol=1e-4
     )
@@ -216,16 +212,11 @@ def test_file_names_in_the_gzip_header_are_skipped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("format", [SPZ, SPZ_3], ids=lambda format: format.name)
-def test_unknown_flags_are_noted_and_levels_of_detail_refused(tmp_path: Path, format: SceneFormat) -> None:
+def test_levels_of_detail_are_refused(tmp_path: Path, format: SceneFormat) -> None:
     data = encoded(tmp_path, format)
-    for flag in (0x40, 0x80):
-        raw = bytearray(gzip.decompress(data) if format is SPZ_3 else data)
-        raw[14] |= flag
-        if flag == 0x80:
-            refused(tmp_path, bytes(raw), "levels of detail of Spark")
-        else:
-            (tmp_path / "scene").write_bytes(bytes(raw))
-            assert "the flags 0x40 of the SPZ header are unknown and ignored" in read_scene(tmp_path / "scene").notes
+    raw = bytearray(gzip.decompress(data) if format is SPZ_3 else data)
+    raw[14] |= 0x80
+    refused(tmp_path, bytes(raw), "levels of detail of Spark")
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
