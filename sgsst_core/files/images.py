@@ -1,9 +1,6 @@
 """Readers and writers of images as float32 tensors [H, W, 3] of sRGB values in 0..1.
 
-Pillow finds metadata that follow the pixels of a PNG only by decoding all of them. It therefore gets a PNG's metadata
-first, as far as they are used, and then its pixels.
-
-Colors are converted to sRGB by ICC profiles, or by those that a PNG's color chunks describe.
+Colors are converted to sRGB by ICC profiles.
 """
 
 from __future__ import annotations
@@ -11,12 +8,9 @@ from __future__ import annotations
 import functools
 import io
 import math
-import os
 import re
-import struct
 import warnings
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageCms, ImageOps, PngImagePlugin, UnidentifiedImageError
+from PIL import Image, ImageCms, PngImagePlugin, UnidentifiedImageError
 from torch import Tensor
 
 from sgsst_core.errors import ImageError
@@ -55,23 +49,22 @@ _JPEG_QUALITY = 95
 #: Largest pixel of a float image whose white is 1. Resampling and sharpening overshoot.
 _OVERSHOOT = 2.0
 _EXIF_ORIENTATION = 0x0112
-#: EXIF orientations that swap width and height.
-_SWAPPING = (5, 6, 7, 8)
+#: What makes an image upright, by its EXIF orientation.
+_UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
 _JPEG_MARKER = re.compile(rb"\xff([\x01-\xfe])")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 #: Markers without a segment: TEM, restarts and the start of the image.
 _BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 #: Maximum length of a compressed text or profile of a PNG; Pillow's own limit, 1 MiB, is too low for some profiles.
 PngImagePlugin.MAX_TEXT_CHUNK = 16 << 20
-#: Chunks before the pixels that determine them, or the number of frames.
-_COPIED = (b"IHDR", b"PLTE", b"tRNS", b"acTL", b"fcTL")
-#: Chunks that state colors without a profile.
-_COLOR_CHUNKS = (b"cICP", b"sRGB", b"gAMA", b"cHRM")
-#: Other chunks that are used, and texts that may hold the orientation.
-_METADATA, _TEXTS = (b"eXIf", b"iCCP"), (b"tEXt", b"zTXt", b"iTXt")
-_USED_TEXTS = (b"XML:com.adobe.xmp\0", b"Raw profile type exif\0")
-_PNG_END = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
 
 
 class ImageWarning(UserWarning):
@@ -89,8 +82,8 @@ def load_image(
 ) -> Tensor:
     """Read an image in one of `FORMATS` or HEIC, or the first frame of an animated one.
 
-    Colors are converted to sRGB by the image's ICC profile, or a PNG's chunks cICP, gAMA and cHRM; images without them
-    are taken for sRGB. Palettes, gray, 16 bits and CMYK are converted to RGB.
+    Colors are converted to sRGB by the image's ICC profile; images without one are taken for sRGB. Palettes, gray, 16
+    bits and CMYK are converted to RGB.
 
     Args:
         background: sRGB color behind transparent parts, in 0..1; white by default.
@@ -118,14 +111,15 @@ def load_image(
             _check_scans(path)
         if image.format not in _STILL and getattr(image, "is_animated", False):
             warn(f"{path.name}: only its first frame is used")
+        upright = _UPRIGHT.get(_orientation(image)) if oriented else None
         factor = _reduction(image, max_pixels)
         if factor > 1:
             image.draft(None, (image.width // factor, image.height // factor))  # JPEG is decoded at a lower resolution
         image.load()
         profile = _profile_of(path, image, warn) if color_managed else None
         small = _reduced(image, _reduction(image, max_pixels))
-        upright = ImageOps.exif_transpose(small) if oriented else small
-        return torch.from_numpy(_to_rgb(path, upright, profile, background))
+        pixels = _to_rgb(path, small if upright is None else small.transpose(upright), profile, background)
+        return torch.from_numpy(pixels)
 
 
 def _reduction(image: Image.Image, max_pixels: int) -> int:
@@ -155,7 +149,7 @@ def image_size(path: Path) -> tuple[int, int]:
         ImageError: If the file is missing or not an image, or has more than MAX_PIXELS pixels.
     """
     (width, height), orientation = stored_size(path)
-    return (height, width) if orientation in _SWAPPING else (width, height)
+    return (height, width) if orientation >= 5 else (width, height)
 
 
 def stored_size(path: Path) -> tuple[tuple[int, int], int]:
@@ -164,11 +158,18 @@ def stored_size(path: Path) -> tuple[tuple[int, int], int]:
     Raises:
         ImageError: If the file is missing or not an image, or has more than MAX_PIXELS pixels.
     """
-    with _opened(path, pixels=False) as image:
-        # that of a PNG decodes all pixels to find EXIF data behind them, which `_open_png` has found already
-        exif = Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
-        orientation = exif.get(_EXIF_ORIENTATION, 1)
-        return image.size, orientation if orientation in range(1, 9) else 1
+    with _opened(path) as image:
+        return image.size, _orientation(image)
+
+
+def _orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation that the header of an image states, 1 to 8; 1 if it has none."""
+    if image.format == "TIFF":  # Pillow makes it upright itself
+        return 1
+    # that of a PNG would decode all pixels to find EXIF data behind them
+    exif = Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
+    orientation = exif.get(_EXIF_ORIENTATION, 1)
+    return orientation if orientation in range(1, 9) else 1
 
 
 def save_png(path: Path, image: Tensor) -> None:
@@ -187,22 +188,15 @@ def save_jpg(path: Path, image: Tensor) -> None:
 
 
 @contextmanager
-def _opened(path: Path, *, pixels: bool = True) -> Iterator[Image.Image]:
-    """Open an image and check its size. Decoding errors inside the block are raised as ImageError.
-
-    Without `pixels`, the image can only be asked for its header.
-    """
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """Open an image and check its size. Decoding errors inside the block are raised as ImageError."""
     try:
         with path.open("rb") as file:
             head = file.read(12)
-        is_png = head.startswith(_PNG_SIGNATURE)
-        source, colors = _open_png(path, pixels=pixels) if is_png else (path, dict[bytes, bytes]())
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
-            opened = Image.open(source, formats=[*FORMATS, *_heif_format(path, head)])
+            opened = Image.open(path, formats=[*FORMATS, *_heif_format(path, head)])
         with opened as image:
-            if is_png and (b"cICP" in colors or not image.info.get("icc_profile")):
-                image.info["icc_profile"] = colors
             if image.width * image.height > MAX_PIXELS:
                 raise Image.DecompressionBombError
             yield image
@@ -258,11 +252,7 @@ def _heif_format(path: Path, head: bytes) -> tuple[str, ...]:
 def _profile_of(path: Path, image: Image.Image, warn: Callable[[str], None]) -> ColorProfile | None:
     """Return the color profile of an image; None if it has none that changes colors."""
     data = image.info.get("icc_profile")
-    try:
-        data = png_profile(data) if isinstance(data, dict) else data
-    except ValueError as error:
-        warn(f"{path.name}: its colors are taken for sRGB, because {error}")
-    if not data or isinstance(data, dict):
+    if not data:
         return None
     gray = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
     mode = "L" if gray else "CMYK" if image.mode == "CMYK" else "RGB"
@@ -327,50 +317,6 @@ def to_image(image: Tensor) -> Image.Image:
     return Image.fromarray(values.numpy())
 
 
-def _open_png(path: Path, *, pixels: bool) -> tuple[io.BytesIO, dict[bytes, bytes]]:
-    """Return a PNG for Pillow, and the contents of the chunks that state its colors without a profile.
-
-    Of each kind of metadata, the last chunk counts.
-
-    Args:
-        path: File that starts with `_PNG_SIGNATURE`.
-        pixels: Whether the pixels are needed; without them, the file is only good for its header.
-
-    Raises:
-        ValueError: If a chunk is beyond the end of the file.
-        OSError: If the file cannot be read.
-    """
-    chunks, start, stop = [_PNG_SIGNATURE], 0, 0
-    colors: dict[bytes, bytes] = {}
-    metadata: dict[bytes, bytes] = {}
-    with path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        position = file.seek(len(_PNG_SIGNATURE))
-        while position < size:
-            file.seek(position)
-            header = file.read(8)
-            length, kind = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
-            stop_of_chunk = position + 12 + length
-            if kind == b"IDAT":
-                start, stop = start or position, stop_of_chunk
-            elif kind == b"IEND" or (start and stop_of_chunk > size):
-                break
-            elif stop_of_chunk > size:
-                raise ValueError("its header is incomplete")
-            elif kind in _COLOR_CHUNKS:
-                colors[kind] = file.read(min(length, 32))
-            elif kind in _COPIED and not start:
-                chunks.append(header + file.read(length + 4))
-            elif kind in _METADATA or (kind in _TEXTS and file.read(32).startswith(_USED_TEXTS)):
-                file.seek(position)
-                metadata[kind] = file.read(length + 12)
-            position = stop_of_chunk
-        file.seek(start)
-        data = file.read(stop - start if pixels else 8) if start else b""
-    end = _PNG_END if start and stop <= size else b""
-    return io.BytesIO(b"".join([*chunks, *metadata.values(), data, end])), colors
-
-
 #: Maximum size of a profile in bytes. Those of printing processes have up to 3 MB.
 MAX_PROFILE_BYTES = 4 << 20
 #: Modes of images by the color spaces of profiles.
@@ -379,31 +325,6 @@ _MODES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}
 _ROUNDING = 1
 #: Spacing of the 8-bit colors for which a profile is compared with sRGB.
 _PROBE_STEP = 15
-_D50 = np.array([0.9642, 1.0, 0.8249])
-#: Cone responses of the Bradford adaptation (ICC.1:2010, annex E).
-_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-_D65 = (0.3127, 0.3290)
-_REC_709 = (_D65, (0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
-#: Chromaticities of white, red, green and blue, by the numbers of ITU-T H.273, table 2, in cICP.
-_PRIMARIES = {
-    1: _REC_709,
-    5: (_D65, (0.64, 0.33), (0.29, 0.60), (0.15, 0.06)),
-    6: (_D65, (0.63, 0.34), (0.31, 0.595), (0.155, 0.07)),
-    9: (_D65, (0.708, 0.292), (0.17, 0.797), (0.131, 0.046)),
-    11: ((0.314, 0.351), (0.68, 0.32), (0.265, 0.69), (0.15, 0.06)),
-    12: (_D65, (0.68, 0.32), (0.265, 0.69), (0.15, 0.06)),
-}
-_SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
-_REC_709_CURVE = (1 / 0.45, 1 / 1.099, 0.099 / 1.099, 1 / 4.5, 0.081)
-#: Parameters of `_matrix_profile` by the numbers of ITU-T H.273, table 3.
-_CURVES: dict[int, tuple[float, ...]] = {
-    **{4: (2.2,), 5: (2.8,), 8: (1.0,), 13: _SRGB_CURVE},
-    **dict.fromkeys((1, 6, 14, 15), _REC_709_CURVE),
-}
-#: Exponent that stands for sRGB with its primaries, as the specification of PNG recommends, and rounding.
-_SRGB_GAMMA, _GAMMA_ROUNDING, _PRIMARY_ROUNDING = 2.2, 0.02, 0.001
-#: Exponents of curves that are believed.
-_GAMMAS = (0.1, 10.0)
 
 
 class ColorProfile:
@@ -467,70 +388,6 @@ class ColorProfile:
             probe = Image.fromarray(np.stack(np.meshgrid(axis, axis, axis), axis=3).reshape(len(axis), -1, 3))
         change = np.asarray(self.to_srgb(probe), np.int16) - np.asarray(probe.convert("RGB"), np.int16)
         return int(np.abs(change).max()) > _ROUNDING
-
-
-def png_profile(chunks: Mapping[bytes, bytes]) -> bytes:
-    """Return the ICC profile that the color chunks of a PNG state; empty for sRGB.
-
-    Args:
-        chunks: Contents of cICP, sRGB, gAMA and cHRM, in this order of precedence.
-
-    Raises:
-        ValueError: If they cannot be converted. The message is the reason.
-    """
-    if cicp := chunks.get(b"cICP"):
-        primaries, transfer, *rest = cicp.ljust(4, b"\0")[:4]
-        if primaries not in _PRIMARIES or transfer not in _CURVES or rest != [0, 1]:
-            raise ValueError(f"their cICP chunk states {' '.join(map(str, cicp[:4]))}, such as HDR, which is not read")
-        return _matrix_profile(_PRIMARIES[primaries], _CURVES[transfer])
-    if b"sRGB" in chunks or not chunks:
-        return b""
-    points: Sequence[tuple[float, float]] = _REC_709
-    curve: Sequence[float] = _SRGB_CURVE
-    try:
-        if b"cHRM" in chunks:
-            values = [value / 1e5 for value in struct.unpack(">8I", chunks[b"cHRM"])]
-            points = list(zip(values[::2], values[1::2], strict=True))
-        if b"gAMA" in chunks:
-            gamma = 1e5 / struct.unpack(">I", chunks[b"gAMA"])[0]
-            is_srgb = abs(gamma - _SRGB_GAMMA) < _GAMMA_ROUNDING and np.allclose(points, _REC_709, 0, _PRIMARY_ROUNDING)
-            curve = _SRGB_CURVE if is_srgb else (gamma,)
-        return _matrix_profile(points, curve)
-    except (ArithmeticError, struct.error, np.linalg.LinAlgError) as error:
-        raise ValueError("their gAMA or cHRM chunk is broken") from error
-
-
-def _matrix_profile(points: Sequence[tuple[float, float]], curve: Sequence[float]) -> bytes:
-    """Return the profile of an RGB space (ICC.1:2010).
-
-    Args:
-        points: Chromaticities xy of white, red, green and blue.
-        curve: Exponent; or exponent, a, b, c and d of (a x + b)^exponent from d on and c x below.
-
-    Raises:
-        ArithmeticError: If the values are those of no space.
-    """
-    white, *columns = (np.array([x / y, 1, (1 - x - y) / y]) for x, y in points)
-    matrix = np.stack(columns, axis=1)
-    matrix *= np.linalg.solve(matrix, white)
-    adapted = np.linalg.solve(_BRADFORD, np.diag(_BRADFORD @ _D50 / (_BRADFORD @ white)) @ _BRADFORD @ matrix)
-    if not (np.abs(adapted) < 4).all() or np.max(points) > 2 or not _GAMMAS[0] < curve[0] < _GAMMAS[1]:
-        raise ArithmeticError
-
-    def numbers(values: Sequence[float] | NDArray[np.float64]) -> bytes:
-        return bytes(np.rint(65536 * np.asarray(values)).astype(">i4").data)
-
-    tags = {"wtpt": b"XYZ " + bytes(4) + numbers(_D50)}
-    for name, column in zip("rgb", adapted.T, strict=True):
-        tags[f"{name}XYZ"] = b"XYZ " + bytes(4) + numbers(column)
-        tags[f"{name}TRC"] = struct.pack(">4s4xH2x", b"para", 3 if len(curve) > 1 else 0) + numbers(curve)
-    table, body = struct.pack(">I", len(tags)), b""
-    for name, tag in tags.items():
-        table += struct.pack(">4sII", name.encode(), 132 + 12 * len(tags) + len(body), len(tag))
-        body += tag
-    size = 128 + len(table) + len(body)
-    head = struct.pack(">I4xI4s4s4s12x4s", size, 2 << 24, b"mntr", b"RGB ", b"XYZ ", b"acsp").ljust(68, b"\0")
-    return (head + numbers(_D50)).ljust(128, b"\0") + table + body
 
 
 def _without_float_conversions(data: bytes) -> bytes:
