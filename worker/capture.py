@@ -27,7 +27,6 @@ from worker.job import SceneRequest
 
 #: Axes of an SPZ scene are those under which a typical view shows this many times as many Gaussians.
 _CLEARLY_MORE = 2.0
-_PERHAPS_NOT_ALL = "warning: they may not be all"
 _ROTATED = "the scene is rotated by 180 degrees about x (rub: y up, z backward)"
 
 
@@ -117,12 +116,12 @@ def read_capture(
         CameraError: If the cameras cannot be used.
     """
     orbit = None
-    notes: list[str] = []
+    decisions: list[Decision] = []
     if source.cameras is None:
         orbit = make_orbit(scene, orbit_request(source), remaining)
         cameras = list(orbit.cameras)
     else:
-        cameras = read_cameras(source.cameras, images, notes.append)
+        cameras = read_cameras(source.cameras, images)
     names = tuple(dict.fromkeys(map(photo_name, cameras)))
     panoramas = len({camera.panorama for camera in cameras} - {None})
     if source.views is not None:
@@ -130,7 +129,6 @@ def read_capture(
     sizes = [photo_size(camera) for camera in cameras]
     if source.resolution is not None:
         cameras = [resized(camera, source.resolution) for camera in cameras]
-    decisions = [Decision("cameras", _PERHAPS_NOT_ALL, note) for note in notes]
     if panoramas:
         reason = "views are pinholes: one for each face of a cube, with the panorama's pixels per degree in its middle"
         decisions.append(Decision("cameras", f"{panoramas} of {len(names)} are panoramas, six views each", reason))
@@ -153,7 +151,7 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
             return requested, []
         cameras = None
         if source.cameras is not None:
-            cameras = read_cameras(source.cameras, images, lambda note: None)  # `read_capture` reports the notes
+            cameras = read_cameras(source.cameras, images)
         scene = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes="rdf").scene
     except (SceneError, CameraError):
         return requested, []

@@ -7,7 +7,6 @@ import json
 import re
 import sys
 import time
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, requires
@@ -28,7 +27,6 @@ from api.cli.console import (
 from service.states import ACTIONS
 from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import DISK_FULL
-from sgsst_core.files.camera_folder import CameraWarning
 from worker.processes import process_start
 
 _DISTRIBUTION = "sgsst-service"
@@ -76,7 +74,6 @@ _SUMMARIES: dict[str, dict[str, str]] = {
 _MODULES = {name: module for module, names in _SUMMARIES.items() for name in names}
 #: Base of errors in the arguments, which typer does not export.
 _UsageError: Any = typer.BadParameter.__base__
-_formatted = warnings.formatwarning
 
 
 class _Commands(Mapping[str, Any]):
@@ -174,7 +171,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(invocation: Invocation) -> int:
     """Run a command. Expected errors become one message on stderr and an exit code, without a traceback."""
     arguments = invocation.arguments
-    warnings.formatwarning = _format_warning
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":  # file names hold any characters
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -237,15 +233,6 @@ def _missing_extra(error: ModuleNotFoundError) -> str | None:
                 f"Run `pip install '{_DISTRIBUTION}[{matched[2]}]'`."
             )
     return None
-
-
-def _format_warning(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
-) -> str:
-    """Return a warning about the user's cameras as a line without the place in the code that issued it."""
-    if category is CameraWarning:
-        return f"warning: {message}\n"
-    return _formatted(message, category, filename, lineno, line)
 
 
 def _print_error(arguments: Sequence[str], code: str, detail: str, problem: Mapping[str, object] | None = None) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from api.client.transport import ApiError, Progress, RequestError, Transport, in_thread, json_text
-from sgsst_core.files.camera_folder import find_cameras, issue_warning, label
+from sgsst_core.files.camera_folder import find_cameras, label
 from sgsst_core.files.formats import scene_path
 from sgsst_core.files.formats.sog import INDEX_NAME, pack
 
@@ -182,15 +182,14 @@ def different_names(paths: Sequence[Path]) -> list[str]:
 def camera_files(path: Path) -> list[Path]:
     """Return the camera files for a path: a JSON file, a COLMAP model or a folder with either.
 
-    It accepts the same paths as `sgsst stylize --cameras`, and issues a `CameraWarning` for a COLMAP model that is
-    smaller than one beside it.
+    It accepts the same paths as `sgsst stylize --cameras`.
 
     Raises:
         RequestError: If the path does not exist.
         CameraError: If there are none.
     """
     _check_exists(path)
-    cameras = find_cameras(path, issue_warning)
+    cameras = find_cameras(path)
     if cameras.is_dir():
         return _model_files(cameras) or [path]
     companion = cameras.with_name("dataparser_transforms.json")

@@ -23,13 +23,9 @@ from numpy.typing import NDArray
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.advice import refuse_camera_json
 from sgsst_core.files.camera_folder import (
-    COMPARE,
     FORMATS,
-    QUATERNION_TOLERANCE,
     ColmapCamera,
-    Warn,
     find_cameras,
-    issue_warning,
     load_json,
     read_model,
 )
@@ -42,13 +38,13 @@ from sgsst_core.scene.panorama import cube_faces
 #: Largest deviation of a size from whole pixels that is attributed to rounding: 119.99999 is 120.
 _WHOLE_TOLERANCE = 0.01
 
+#: Largest deviation of a quaternion's length from 1 that is attributed to rounding in the file.
+_QUATERNION_TOLERANCE = 0.01
+
 #: Names of the camera model of 360-degree panoramas.
 _PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")
 #: Other camera models without a focal length.
 _NO_PINHOLES = ("ORTHOPHOTO", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
-#: Offset of a principal point from the middle of an image, relative to half its sides, above which an image counts as
-#: resized if the file gives no sizes.
-_OFF_CENTER = 0.1
 #: COLMAP's camera models with a single focal length; the others have two.
 _ONE_FOCAL = (
     *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE"),
@@ -56,7 +52,7 @@ _ONE_FOCAL = (
 )
 
 
-def read_cameras(path: Path, photos: Path | None = None, warn: Warn | None = None) -> list[Camera]:
+def read_cameras(path: Path, photos: Path | None = None) -> list[Camera]:
     """Detect the format of a camera file or folder (see `find_cameras`), and read its cameras.
 
     Cameras from JSON keep their order; COLMAP's images are sorted by name. A panorama has its front face in its place;
@@ -70,16 +66,14 @@ def read_cameras(path: Path, photos: Path | None = None, warn: Warn | None = Non
     Args:
         photos: Folder of the photos, whose sizes cameras get if the file states none. None looks for them beside the
             file, at the paths that it states.
-        warn: Callback for cameras that may not be all; None to issue a `CameraWarning`.
 
     Raises:
         CameraError: If the file is missing, its format is unknown, it holds no cameras, a camera cannot be a pinhole,
             or a value is invalid. The message names the file and the camera.
     """
-    warn = warn or issue_warning
-    file = find_cameras(path, warn)
+    file = find_cameras(path)
     if file.is_dir():
-        return _read_colmap(file, warn)
+        return _read_colmap(file)
     content = load_json(file)
     refuse_camera_json(file, content)
     if isinstance(content, list):
@@ -210,12 +204,6 @@ def _transforms_intrinsics(
         raise CameraError(f"{where}: gives neither fl_x nor camera_angle_x. Add one.")
     cx = _number(where, values, "cx") if "cx" in values else size[0] / 2
     cy = _number(where, values, "cy") if "cy" in values else size[1] / 2
-    off_center = min(abs(2 * cx / size[0] - 1), abs(2 * cy / size[1] - 1)) > _OFF_CENTER
-    if off_center and not ("w" in values and "h" in values):
-        raise CameraError(
-            f"{where}: gives no size, its image has {size[0]} x {size[1]}, and its principal point is at {cx:g}, "
-            f"{cy:g}. The image seems to be resized; add the sizes of the original images as 'w' and 'h'."
-        )
     return fx, fx if fy is None else fy, cx, cy
 
 
@@ -242,9 +230,8 @@ def _training_frame(path: Path, content: Mapping[str, Any]) -> tuple[NDArray[Any
     return change, _positive(str(dataparser), "scale", scale)
 
 
-def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:
-    notes: list[str] = []
-    lenses, images = read_model(folder, notes.append)
+def _read_colmap(folder: Path) -> list[Camera]:
+    lenses, images = read_model(folder)
     cameras = []
     for image in sorted(images, key=lambda image: image.name):
         where = f"{folder}: image {image.name!r}"
@@ -267,13 +254,7 @@ def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:
             pinhole = (of_photos.fx, of_photos.fy, of_photos.cx, of_photos.cy)
             cameras.append([_camera(where, image.name, size, pinhole, matrix, of_photos)])
     if not cameras:
-        reasons = "".join(f" {note}." for note in notes)
-        raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.{reasons}")
-    unused = len(lenses.keys() - {image.camera for image in images})
-    if unused:
-        notes.append(f"{folder}: {unused:,} of {len(lenses):,} cameras belong to no image. {COMPARE}")
-    for note in notes:
-        warn(note)
+        raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.")
     return _by_face(cameras)
 
 
@@ -292,7 +273,7 @@ def _colmap_lens(where: str, camera: ColmapCamera) -> Lens:
 def _rotation_matrix(where: str, quaternion: Sequence[float]) -> NDArray[Any]:
     """Convert a unit quaternion wxyz to a matrix [3, 3], with the same rounding as COLMAP."""
     w, x, y, z = quaternion
-    if not abs(math.hypot(w, x, y, z) - 1) <= QUATERNION_TOLERANCE:  # length 0 would give the identity
+    if not abs(math.hypot(w, x, y, z) - 1) <= _QUATERNION_TOLERANCE:  # length 0 would give the identity
         raise CameraError(f"{where}: its quaternion has length {math.hypot(w, x, y, z):.3g}, not 1. Export it again.")
     x2, y2, z2 = 2 * x, 2 * y, 2 * z
     return np.array(
@@ -350,13 +331,9 @@ def _name(where: str, entry: Mapping[str, Any], *keys: str) -> str:
 
 
 def _wrong(where: str, key: str, value: Any, expected: str, verb: str = "is") -> CameraError:
-    """Return the error about a value of another kind than expected, which shows text in quotes."""
-    kinds: dict[type, str] = {str: "the text ", list: "the list ", dict: "the object "}
+    """Return the error about a value of another kind than expected, as JSON shows it."""
     shown = json.dumps(value, ensure_ascii=False)[:40]
-    advice = "Write it without quotes, or export" if isinstance(value, str) else "Export"
-    return CameraError(
-        f"{where}: {key!r} {verb} {kinds.get(type(value), '')}{shown}, not {expected}. {advice} the cameras again."
-    )
+    return CameraError(f"{where}: {key!r} {verb} {shown}, not {expected}. Export the cameras again.")
 
 
 def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> NDArray[Any]:

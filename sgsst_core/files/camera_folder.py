@@ -2,20 +2,16 @@
 
 COLMAP's models are read, binary or text, as its "Output Format" page defines them. Only `cameras` and `images` are
 read, which contain everything that a view needs: COLMAP writes the pose of each image into `images`, even if `rigs` and
-`frames` also determine it. `points3D`, `rigs` and `frames` are never opened. What is in a file but belongs to no entry
-is counted and reported.
+`frames` also determine it. `points3D`, `rigs` and `frames` are never opened.
 """
 
 from __future__ import annotations
 
 import codecs
-import contextlib
 import json
-import math
 import mmap
 import re
 import struct
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,36 +23,23 @@ from sgsst_core.files.advice import CAMERAS, POINTER, refuse_camera_folder, refu
 FORMATS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
 #: Names of JSON files with cameras, in order of preference. Any other name is read if it is the only one.
 _JSON_NAMES = ("transforms.json", "transforms_train.json", "cameras.json")
-#: Levels of subfolders that are searched for a COLMAP model, and entries per folder and folders per level.
-_SEARCHED_LEVELS, _SEARCHED_ENTRIES = 3, 100
+#: JSON files of a folder that are searched.
+_SEARCHED_FILES = 100
 
 
-class CameraWarning(UserWarning):
-    """Cameras that may not be all, or not those that were meant."""
-
-
-def issue_warning(text: str) -> None:
-    """Issue a `CameraWarning`."""
-    warnings.warn(text, CameraWarning, stacklevel=3)
-
-
-def find_cameras(path: Path, warn: Warn) -> Path:
+def find_cameras(path: Path) -> Path:
     """Return the JSON file or the folder of a COLMAP model that a file or folder stands for.
 
     A folder may be a COLMAP model, may hold such a model in sparse/0, sparse or another folder of sparse, or may hold a
     transforms.json, transforms_train.json, cameras.json, a model in colmap/sparse, or one other JSON file with cameras.
-
-    Args:
-        warn: Callback for a model that is smaller than one beside it.
 
     Raises:
         CameraError: If a folder holds no cameras, or several files with cameras. The message says what it holds.
     """
     if not path.is_dir():
         is_model = path.suffix in (".bin", ".txt") and path.name.startswith(("cameras", "images", "points3D"))
-        return _model(path.parent, warn) if is_model else path
-    named = _named(path) or _only_json(path)
-    return _model(named, warn) if named.is_dir() else named
+        return path.parent if is_model else path
+    return _named(path) or _only_json(path)
 
 
 def cameras_beside(scene: Path) -> Path | None:
@@ -70,7 +53,7 @@ def cameras_beside(scene: Path) -> Path | None:
     """
     folder = scene.absolute().parent
     folders = (folder, folder.parent.parent) if folder.parent.name == "point_cloud" else (folder,)
-    held = (find_cameras(each, lambda text: None) for each in folders if _named(each) or _holding(each))
+    held = (find_cameras(each) for each in folders if _named(each) or _holding(each))
     return next(held, None)
 
 
@@ -107,33 +90,6 @@ def _numbered(folder: Path) -> list[Path]:
     return sorted((path for path in folder.glob("[0-9]*") if path.is_dir()), key=lambda path: (len(path.name), path))
 
 
-def _model(folder: Path, warn: Warn) -> Path:
-    """Return the folder of a model, with a warning if one beside it has more images."""
-    beside = [model for model in _numbered(folder.absolute().parent) if has_model(model)]
-    if folder.absolute() in beside and len(beside) > 1:
-        larger = _largest(beside)
-        count, most = _image_count(folder), _image_count(larger)
-        if count < most:
-            larger = folder.with_name(larger.name) if folder.name else larger
-            warn(
-                f"{folder} has {count:,} images, and the model {larger} beside it {most:,}. COLMAP writes several "
-                f"models if it cannot connect all photos. Add --cameras {larger} if the scene was trained with that one"
-            )
-    return folder
-
-
-def _largest(models: Sequence[Path]) -> Path:
-    """Return the model with the most images, the first of several."""
-    return max(models, key=_image_count)
-
-
-def _image_count(model: Path) -> int:
-    """Return the number of images of a model; 0 if it cannot be read."""
-    with contextlib.suppress(CameraError):
-        return len(read_model(model, lambda text: None)[1])
-    return 0
-
-
 def _only_json(folder: Path) -> Path:
     """Return the only JSON file in a folder that holds cameras."""
     files, holding = _json_files(folder), _holding(folder)
@@ -142,9 +98,6 @@ def _only_json(folder: Path) -> Path:
         raise CameraError(f"{folder}: holds several files with cameras: {names}. Give one of them.")
     if holding:
         return holding[0]
-    models = _models_below(folder)
-    if models:
-        raise CameraError(f"{folder}: holds no cameras, but {_largest(models)} has a COLMAP model. Give that folder.")
     refuse_camera_folder(folder)
     if len(files) == 1:
         return files[0]  # its reader says what is wrong with it
@@ -154,7 +107,7 @@ def _only_json(folder: Path) -> Path:
 
 def _json_files(folder: Path) -> list[Path]:
     """Return the JSON files in a folder that are searched."""
-    return [path for path in sorted(folder.glob("*.json"))[:_SEARCHED_ENTRIES] if path.is_file()]
+    return [path for path in sorted(folder.glob("*.json"))[:_SEARCHED_FILES] if path.is_file()]
 
 
 def _holding(folder: Path) -> list[Path]:
@@ -175,30 +128,11 @@ def _holds_cameras(path: Path) -> bool:
     return isinstance(first, dict) and {"rotation", "position"} <= first.keys()
 
 
-def _models_below(folder: Path) -> list[Path]:
-    """Return the COLMAP models in the first level of subfolders that has any, among the entries that are searched."""
-    level = [folder]
-    with contextlib.suppress(OSError):
-        for _ in range(_SEARCHED_LEVELS):
-            entries = [entry for parent in level for entry in sorted(parent.iterdir())[:_SEARCHED_ENTRIES]]
-            level = [entry for entry in entries if entry.is_dir()][:_SEARCHED_ENTRIES]
-            models = [entry for entry in level if has_model(entry)]
-            if models:
-                return models
-    return []
-
-
 T = TypeVar("T")
-Warn = Callable[[str], None]
 
 _CONVERT = "Convert it with `colmap image_undistorter`, and give the OUT/sparse that it writes"
 _EXPORT_AGAIN = "Export the model again."
-#: Advice of warnings about files whose entries may not be all.
-COMPARE = "If views are missing, export the model again"
-_HEAD_BYTES = 4096
 
-#: Largest deviation of a quaternion's length from 1 that is attributed to rounding in the file.
-QUATERNION_TOLERANCE = 0.01
 #: COLMAP's camera models by number: name and number of parameters.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
@@ -227,8 +161,6 @@ _INTEGER = re.compile("[0-9]{1,18}")
 _NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 #: Line of points: x, y and ID of the 3D point of each. The possessive quantifiers keep the time linear.
 _POINTS = re.compile(rb"(?:(?:(?:[-+.0-9eE]++|-?nan|-?inf)(?:\s++|$)){3}+)++")
-#: Number of entries in the comment that COLMAP writes at the beginning of a text file.
-_DECLARED = re.compile(rb"# Number of (?:cameras|images): ([0-9]{1,18})\b")
 
 
 @dataclass(frozen=True)
@@ -258,13 +190,10 @@ class ColmapImage:
     translation: Sequence[float]
 
 
-def read_model(folder: Path, warn: Warn) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
+def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
     """Read the cameras by ID, and the registered images in the file's order.
 
     Binary files take precedence over text files, as in COLMAP.
-
-    Args:
-        warn: Callback for files with more or less than they declare.
 
     Raises:
         CameraError: If a file is missing, truncated, or has an invalid value. The message names the file.
@@ -272,18 +201,11 @@ def read_model(folder: Path, warn: Warn) -> tuple[dict[int, ColmapCamera], list[
     cameras, images = folder / "cameras.bin", folder / "images.bin"
     if cameras.is_file():
         return (
-            _by_id(cameras, _binary(cameras, _binary_camera, warn)),
-            list(_by_id(images, _binary(images, _binary_image, warn)).values()),
+            _by_id(cameras, _binary(cameras, _binary_camera)),
+            list(_by_id(images, _binary(images, _binary_image)).values()),
         )
     cameras, images = folder / "cameras.txt", folder / "images.txt"
-    intrinsics = _by_id(cameras, _text_cameras(cameras))
-    poses = _by_id(images, _text_images(images))
-    for path, count in ((cameras, len(intrinsics)), (images, len(poses))):
-        with path.open("rb") as file:
-            stated = _DECLARED.search(file.read(_HEAD_BYTES))
-        if stated and int(stated[1]) != count:
-            warn(f"{path}: holds {count:,} {path.stem}, but its first lines state {int(stated[1]):,}. {COMPARE}")
-    return intrinsics, list(poses.values())
+    return _by_id(cameras, _text_cameras(cameras)), list(_by_id(images, _text_images(images)).values())
 
 
 def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
@@ -303,7 +225,7 @@ def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
     return by_id
 
 
-def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]], warn: Warn) -> Iterator[tuple[int, T]]:
+def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]]) -> Iterator[tuple[int, T]]:
     """Yield as many entries as the file declares."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         position, count = 8, struct.unpack_from("<Q", data)[0]
@@ -318,9 +240,6 @@ def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]], wa
                     "the model again."
                 )
             yield number, entry
-        if position < len(data):
-            left = len(data) - position
-            warn(f"{path}: has {left:,} bytes after the {count:,} {path.stem} that it declares. {COMPARE}")
 
 
 def _binary_camera(data: mmap.mmap, position: int) -> tuple[int, ColmapCamera, int]:
@@ -368,7 +287,7 @@ def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
     may_be_points = False
     for where, line in _lines(path):
         words = [label(word) for word in line.split(maxsplit=9)]
-        if not line or (may_be_points and _POINTS.fullmatch(line) and not _is_pose(words)):
+        if not line or (may_be_points and _POINTS.fullmatch(line)):
             may_be_points = False
             continue
         if len(words) != 10:
@@ -379,13 +298,6 @@ def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
         pose = [_number(where, word) for word in words[1:8]]
         yield _integer(where, words[0]), ColmapImage(words[9], _integer(where, words[8]), pose[:4], pose[4:])
         may_be_points = True
-
-
-def _is_pose(words: Sequence[str]) -> bool:
-    """Return whether the words of a line of numbers are those of an image, whose name may be a number too."""
-    ids = all(_INTEGER.fullmatch(word) for word in (words[0], *words[8:9]))
-    numbers = len(words) >= 9 and all(_NUMBER.fullmatch(word) for word in words[1:8])
-    return ids and numbers and abs(math.hypot(*map(float, words[1:5])) - 1) <= QUATERNION_TOLERANCE
 
 
 def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
