@@ -35,7 +35,7 @@ from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.images import WHITE, Color, image_size, load_image
 from sgsst_core.files.photos import Photo, check_names, find_masks, load_photo
-from sgsst_core.files.scene_file import SceneFile, check_sh_attenuation, read_property, read_scene
+from sgsst_core.files.scene_file import SceneFile, read_property, read_scene
 from sgsst_core.orbit import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.facts import check_scales
@@ -156,7 +156,6 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
             lambda: (*choose_axes(source, images), about_background(source.scene, settings.background))
         )
         scene_file, reader = _read_scene(request, axes, collectives, limits)
-        together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
     with errors_of("cameras"):
         check_choice(source)
         capture = _capture_on_all_ranks(request, scene_file, collectives).fitted(settings)

@@ -32,8 +32,7 @@ from sgsst_core.quality.study import VoteShare, check_names, write_study
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import machine, plan_json
 from sgsst_core.report.images import write_views
-from sgsst_core.scene.camera import Camera, resized
-from sgsst_core.scene.panorama import faces_to_render, join_faces, level
+from sgsst_core.scene.camera import Camera, faces_to_render, join_faces, level, resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from worker.capture import orbit_request
 from worker.derived import blend

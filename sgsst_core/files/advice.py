@@ -13,8 +13,6 @@ from sgsst_core.errors import CameraError, InvalidInputError, SceneError
 _HEAD_BYTES = 4096
 #: Signatures in the first bytes of a PyTorch checkpoint: the first file of its ZIP archive, and pickle.
 _CHECKPOINT, _PICKLE = b"/data.pkl", (b"\x80\x02", b"\x80\x04", b"\x80\x05")
-_OBJ_LINE = re.compile(rb"(#[^\n]*|\s*)(\r?\n|$)|(mtllib|o|g|usemtl|v|vt|vn|vp|s|f) [^\n]*(\r?\n|$)")
-_OBJ_LINES = 8
 #: Scenes in the folders of a run, in order of preference: of the original code, of gsplat, any, and an unpacked SOG.
 _SCENES_IN_RUNS = ("point_cloud/iteration_*/point_cloud.ply", "ply/*.ply", "*.ply", "meta.json")
 _AS_COLMAP = "Export the cameras as a COLMAP model, or give those that the scene was trained with."
@@ -33,17 +31,6 @@ def is_checkpoint(head: bytes) -> bool:
 
 def _is_html(head: bytes) -> bool:
     return head[:20].lower().startswith((b"<!doctype html", b"<html"))
-
-
-def _is_obj(head: bytes) -> bool:
-    """Return whether the first lines are those of an OBJ file, with at least one vertex or object."""
-    position, has_vertex = 0, False
-    for _ in range(_OBJ_LINES):
-        line = _OBJ_LINE.match(head, position)
-        if line is None:
-            return False
-        position, has_vertex = line.end(), has_vertex or line[3] is not None
-    return has_vertex
 
 
 def _begins(*starts: bytes, holding: bytes = b"") -> Callable[[bytes], bool]:
@@ -121,7 +108,7 @@ SCENES = (
         _begins(b"{", holding=b'"asset"'),
         (".gltf",),
     ),
-    Kind("an OBJ mesh without Gaussians. Train Gaussians on renders of it first.", _is_obj, (".obj",)),
+    Kind("an OBJ mesh without Gaussians. Train Gaussians on renders of it first.", suffixes=(".obj",)),
 )
 
 #: Kinds of files that are no readable cameras.

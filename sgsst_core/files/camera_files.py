@@ -31,9 +31,8 @@ from sgsst_core.files.camera_folder import (
 )
 from sgsst_core.files.images import image_size
 from sgsst_core.files.photos import PhotoFolder
-from sgsst_core.scene.camera import COEFFICIENTS, FORMULAS, Camera, Lens
+from sgsst_core.scene.camera import COEFFICIENTS, FORMULAS, Camera, Lens, cube_faces
 from sgsst_core.scene.gaussians import exact_rotation
-from sgsst_core.scene.panorama import cube_faces
 
 #: Largest deviation of a size from whole pixels that is attributed to rounding: 119.99999 is 120.
 _WHOLE_TOLERANCE = 0.01

@@ -82,8 +82,6 @@ _STANDARD = {name: (field, column) for field, names in PROPERTIES.items() for co
 }
 #: Names of arrays in notes.
 _TITLES = {"scales": "log scales", "sh_dc": "colors (f_dc)", "sh_rest": "spherical harmonics"}
-#: Properties that differ between the pieces of a split Gaussian.
-_SPLIT = (*PROPERTIES["means"], "opacity", *PROPERTIES["scales"], FILTER_3D)
 
 
 @dataclass(frozen=True)
@@ -120,19 +118,12 @@ class SceneFile:
         """Return the file with its scene refined; the file itself if no Gaussian was split.
 
         Raises:
-            SceneError: If the file stores positions, opacities or scales as integers, or Gaussians are split already.
+            SceneError: If Gaussians are split already.
         """
         if refinement is None or not refinement.split:
             return self
         if self.copies is not None:
             raise SceneError(f"{self.path}: its Gaussians are split already. Save the result, and load it again.")
-        kinds = self.header.vertex.kinds if self.header is not None else {}
-        integers = [name for name in _SPLIT if kinds.get(name, "f")[0] != "f"]
-        if integers:
-            raise SceneError(
-                f"{self.path}: {', '.join(integers)} are stored as integers; smaller Gaussians need float or double. "
-                "Convert the scene first, or leave --refine out."
-            )
         return replace(self, scene=refinement.of(self.scene), copies=piece_counts(refinement.pieces).numpy())
 
     def stylized(self, scene: Scene, refinement: Refinement | None, sh_attenuation: float) -> SceneFile:
@@ -522,7 +513,7 @@ def write_stylized(
         pad_sh: Whether to write the usual properties alone, with SH coefficients of degree 3; see `encode_scene`.
 
     Raises:
-        SceneError: If the source file has changed since it was read, or cannot store attenuated coefficients.
+        SceneError: If the source file has changed since it was read.
         OutputError: If the target cannot be written.
         ValueError: If sh_dc has the wrong shape or non-finite values.
 
@@ -554,7 +545,6 @@ def encode_stylized(
         scene = replace(source.scene.attenuated(sh_attenuation), sh_dc=colors)
         encode_scene(output, scene, PLY, target, pad_sh=pad_sh)
         return
-    check_sh_attenuation(source, sh_attenuation)
     factor = attenuation_factor(sh_attenuation)
     rest = [] if factor == 1 else [name for name in source.header.vertex.kinds if _REST.fullmatch(name)]
     changes = _Changes(_new_columns(source, source.header, colors), rest, factor)
@@ -566,23 +556,6 @@ def encode_stylized(
         output.write(retagged(raw, source.header, source.scene.rendering))
         write = _write_text if source.header.text else _write_binary
         write(source, source.header, changes, file, output)
-
-
-def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
-    """Check that a file can store attenuated coefficients. Scenes of other formats than PLY become a float32 PLY.
-
-    Raises:
-        SceneError: If the coefficients are stored as integers.
-    """
-    if source.header is None or not attenuation:
-        return
-    kinds = source.header.vertex.kinds
-    integers = [name for name, kind in kinds.items() if _REST.fullmatch(name) and kind[0] != "f"]
-    if integers:
-        raise SceneError(
-            f"{source.path}: {integers[0]} is stored as integers, which cannot be attenuated. Convert it to float "
-            "first, or leave --sh-attenuation out."
-        )
 
 
 def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> dict[str, NDArray[np.float32]]:

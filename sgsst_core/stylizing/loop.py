@@ -21,7 +21,7 @@ from torch import Tensor
 from sgsst_core.devices import seconds_left
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import F, as_scene, stylized
-from sgsst_core.files.scene_file import SceneFile, check_sh_attenuation
+from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.planning.time_budget import SecondsLeft, ending_seconds
 from sgsst_core.progress import Progress
 from sgsst_core.scales import has_converged, has_reached, window_length
@@ -344,8 +344,6 @@ def stylize(
     """
     chosen = make_settings(preset, **settings)
     left = seconds_left(chosen.within)
-    if isinstance(scene, SceneFile):
-        check_sh_attenuation(scene, chosen.sh_attenuation)
     with job_bar(Console(highlight=False, markup=False, emoji=False)) if progress else nullcontext() as bar:
         show = bar.show if bar else None
         given = as_scene(scene)

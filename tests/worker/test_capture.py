@@ -16,8 +16,8 @@ from sgsst_core.files.images import BLACK, WHITE, save_png
 from sgsst_core.files.photos import check_names, find_masks, load_photo
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import FACES
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.panorama import FACES
 from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.objects import figure, ground, joined

@@ -125,11 +125,6 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
         )
     if vertex.count == 0:
         raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
-    for name in PROPERTIES["sh_dc"]:
-        if name not in sources and kinds[name][0] != "f":
-            raise SceneError(
-                f"{path}: {name} is stored as integers; new colors need float or double. Convert it first."
-            )
     rest = [name for name in kinds if re.fullmatch(r"f_rest_\d+", name)]
     if len(rest) // 3 not in STORED_COEFFICIENTS.values() or len(rest) % 3:
         raise SceneError(
@@ -139,6 +134,13 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
     if absent:
         raise SceneError(
             f"{path}: f_rest properties are not numbered 0 to {len(rest) - 1}; missing: {', '.join(absent)}."
+        )
+    changed = (*PROPERTIES["means"], *PROPERTIES["scales"], *PROPERTIES["sh_dc"], "opacity", *rest)
+    integers = [name for name in changed if kinds.get(name, "f")[0] != "f"]
+    if integers:
+        raise SceneError(
+            f"{path}: stores {', '.join(integers)[:80]} as integers; values that change need float or double. Convert "
+            "the scene first."
         )
     return len(rest) // 3, sources
 

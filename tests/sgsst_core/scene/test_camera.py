@@ -23,19 +23,24 @@ from sgsst_core.quality.novel_views import neighbors
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import (
+    FACES,
+    OVERLAP,
     Camera,
     CameraPath,
     Lens,
     checked_cameras,
+    cube_faces,
+    faces_to_render,
     fit_cameras,
     framed,
     in_path_order,
+    join_faces,
+    level,
     look_at,
     resized,
     spread,
     undistorted,
 )
-from sgsst_core.scene.panorama import FACES, OVERLAP, cube_faces, faces_to_render, join_faces, level
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.objects import ball, ring, scene_of
