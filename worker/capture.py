@@ -13,8 +13,17 @@ from sgsst_core.errors import CameraError, SceneError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
-from sgsst_core.files.images import WHITE, Color
-from sgsst_core.files.photos import MAX_MISSING, Photo, PhotoFolder, check_photos, photo_name, photo_size, some_names
+from sgsst_core.files.images import (
+    MAX_MISSING,
+    WHITE,
+    Color,
+    Photo,
+    PhotoFolder,
+    check_photos,
+    photo_name,
+    photo_size,
+    some_names,
+)
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit import Orbit, OrbitRequest, find_subject, find_up, make_orbit
 from sgsst_core.planning.survey import compare_photos, frame_warnings, implausible, shown_by

@@ -33,8 +33,7 @@ from sgsst_core.errors import CameraError, ImageError, MaskError, SceneTooLargeE
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes
-from sgsst_core.files.images import WHITE, Color, image_size, load_image
-from sgsst_core.files.photos import Photo, check_names, find_masks, load_photo
+from sgsst_core.files.images import WHITE, Color, Photo, check_names, find_masks, image_size, load_image, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_property, read_scene
 from sgsst_core.orbit import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives

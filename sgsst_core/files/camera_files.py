@@ -29,8 +29,7 @@ from sgsst_core.files.camera_folder import (
     load_json,
     read_model,
 )
-from sgsst_core.files.images import image_size
-from sgsst_core.files.photos import PhotoFolder
+from sgsst_core.files.images import PhotoFolder, image_size
 from sgsst_core.scene.camera import COEFFICIENTS, FORMULAS, Camera, Lens, cube_faces
 from sgsst_core.scene.gaussians import exact_rotation
 

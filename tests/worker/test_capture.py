@@ -12,8 +12,7 @@ from PIL import Image
 from api.cli.scene_tools import render_panorama
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.formats import by_name
-from sgsst_core.files.images import BLACK, WHITE, save_png
-from sgsst_core.files.photos import check_names, find_masks, load_photo
+from sgsst_core.files.images import BLACK, WHITE, check_names, find_masks, load_photo, save_png
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import FACES

@@ -22,7 +22,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.files import camera_folder as colmap_model
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.camera_folder import cameras_beside
-from sgsst_core.files.photos import check_photos, find_masks
+from sgsst_core.files.images import check_photos, find_masks
 from sgsst_core.scene.camera import FACES, Camera, cube_faces, look_at, undistorted
 from tests.small_scenes import LFS_POINTER
 

@@ -23,13 +23,16 @@ from sgsst_core.files.images import (
     MAX_PROFILE_BYTES,
     ColorProfile,
     ImageWarning,
+    Photo,
+    check_photos,
+    find_masks,
     image_size,
     load_image,
+    load_photo,
     save_jpg,
     save_png,
     stored_size,
 )
-from sgsst_core.files.photos import Photo, check_photos, find_masks, load_photo
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.colors import downscale
 from tests.icc_profiles import (
@@ -606,13 +609,6 @@ def test_case_of_a_name_counts_if_files_differ_by_it(tmp_path: Path) -> None:
         save(tmp_path / name, Image.new("RGB", (90, 60)))
     matches = check_photos(tmp_path, [camera("IMG"), camera("img"), camera("B")])
     assert [photo and photo.path.name for photo in matches] == ["IMG.png", None, "b.png"]
-
-
-def test_photos_in_an_unreadable_format_are_named(tmp_path: Path) -> None:
-    for name in ("a.dng", "sub/b.exr", "notes.txt"):
-        save(tmp_path / name, Image.new("RGB", (90, 60)), format="PNG")
-    with pytest.raises(ImageError, match=r"2 views: a\.jpg, b\. Files of these names are \.dng, \.exr: convert them"):
-        check_photos(tmp_path, [camera("a.jpg"), camera("b")])
 
 
 def test_missing_photos_are_named(tmp_path: Path) -> None:

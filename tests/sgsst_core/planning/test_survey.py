@@ -15,8 +15,7 @@ from torch import Tensor
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.images import save_png
-from sgsst_core.files.photos import Photo, check_photos
+from sgsst_core.files.images import Photo, check_photos, save_png
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit import OrbitRequest, make_orbit
 from sgsst_core.planning.survey import compare_photos, fitted_psnr, frame_warnings, implausible, shown_by

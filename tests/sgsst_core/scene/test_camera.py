@@ -18,7 +18,7 @@ from torch import Tensor
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.camera_files import _colmap_lens
 from sgsst_core.files.camera_folder import ColmapCamera
-from sgsst_core.files.photos import undistort
+from sgsst_core.files.images import undistort
 from sgsst_core.quality.novel_views import neighbors
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer

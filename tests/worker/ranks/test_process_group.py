@@ -24,7 +24,7 @@ from benchmarks.stability.sos_reference import layer_statistics_reference
 from sgsst_core.errors import RanksDriftedError, SceneError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics
-from sgsst_core.files.photos import Photo
+from sgsst_core.files.images import Photo
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.messages import decode, encode
 from sgsst_core.parallel.collectives import Collectives, ImageExchange, same_on_all
