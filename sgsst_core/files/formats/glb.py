@@ -9,7 +9,6 @@ https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussi
 glTF has y up, z forward and x left. Scenes are rotated by 180 degrees about z from and to the axes of a PLY, after the
 transformation of the node that holds them.
 
-Gaussians may be a compressed SPZ in the data (KHR_gaussian_splatting_compression_spz_2), with the axes of its library.
 Linear colors are converted to sRGB for each Gaussian.
 
 The specification does not define antialiasing. Written files state the render mode in the `extras` of the primitive.
@@ -53,24 +52,20 @@ from sgsst_core.files.formats.scene_format import (
     truncated,
     whole_number,
 )
-from sgsst_core.files.formats.spz import SPZ_3
 from sgsst_core.scene.rendering import Rendering
 
 _MAGIC = b"glTF"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAX_JSON_BYTES = 1 << 20
-#: Bytes of an SPZ in which its header is read.
-_HEAD_BYTES = 8192
 #: Maximum number of nodes above the one of the Gaussians.
 _MAX_DEPTH = 64
 _MAX_BYTES = (1 << 32) - 1
 _EXTENSION = "KHR_gaussian_splatting"
 #: Extensions that change nothing in what is read. Files that require another one are refused.
 _HARMLESS = re.compile(
-    rf"{_EXTENSION}(_compression_spz_2)?|KHR_mesh_quantization|EXT_(mesh_features|structural_metadata)"
+    rf"{_EXTENSION}|KHR_mesh_quantization|EXT_(mesh_features|structural_metadata)"
     r"|[A-Z]+_(materials|texture|lights|xmp|audio|animation)(_\w+)?"
 )
-_SPZ = f"{_EXTENSION}_compression_spz_2"
 _LINEAR = "lin_rec709_display"
 _SUPPORTED = {
     "kernel": "ellipse",
@@ -128,7 +123,6 @@ class GlbPart:
         frame: Transformation to the axes of a PLY.
         tag: Render mode that the set states.
         linear: Whether colors are linear.
-        spz: Header of the SPZ that holds all attributes, in place of accessors; None if none does.
     """
 
     count: int
@@ -137,12 +131,6 @@ class GlbPart:
     frame: Frame
     tag: RenderTag
     linear: bool
-    spz: SceneHeader | None = None
-
-    @property
-    def coefficients(self) -> int:
-        """Return the number of SH coefficients per color channel above degree 0."""
-        return self.spz.coefficients if self.spz else len(self.harmonics)
 
 
 @dataclass(frozen=True)
@@ -160,7 +148,7 @@ def _read_header(start: FileStart) -> GlbHeader:
         shown, hidden = _shown_splats(path, document)
         required = {each for each in document.get("extensionsRequired", []) if not _HARMLESS.fullmatch(each)}
         for primitive, _ in shown:
-            required |= set(primitive["extensions"][_EXTENSION].get("extensions") or {}) - {_SPZ}
+            required |= set(primitive["extensions"][_EXTENSION].get("extensions") or {})
         if required:
             raise SceneError(
                 f"{path}: its Gaussians need the glTF extension {', '.join(sorted(required))[:80]}, which cannot be "
@@ -169,12 +157,8 @@ def _read_header(start: FileStart) -> GlbHeader:
         parts = [_part(path, document, *each, data) for each in shown]
         notes = [f"{hidden} sets of Gaussians that no node shows are left out"] if hidden else []
         notes += ["animations are left out"] if document.get("animations") else []
-        unknown = {name for each, _ in shown for name in each["extensions"][_EXTENSION]}
-        unknown -= {*_SUPPORTED, "extensions", "extras"}
-        notes += [f"{', '.join(sorted(unknown))[:80]} of {_EXTENSION} are unknown and ignored"] if unknown else []
         linear = "colors are linear, and converted to sRGB for each Gaussian; where Gaussians overlap, renders differ"
         notes += [linear] if any(part.linear for part in parts) else []
-        notes += [note for part in parts if part.spz for note in part.spz.notes]
     except WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
     count = sum(part.count for part in parts)
@@ -182,7 +166,7 @@ def _read_header(start: FileStart) -> GlbHeader:
         raise SceneError(f"{path}: its nodes show {count} Gaussians, more than its {len(data)} bytes can hold.")
     if len({part.tag.rendering for part in parts}) > 1:
         raise SceneError(f"{path}: its {len(parts)} sets of Gaussians have different render modes. Export them apart.")
-    coefficients = max(part.coefficients for part in parts)
+    coefficients = max(len(part.harmonics) for part in parts)
     return GlbHeader(GLB, count, coefficients, parts, notes=tuple(notes), tag=parts[0].tag)
 
 
@@ -254,21 +238,11 @@ def _part(
     attributes = primitive["attributes"]
     refuse_changed_meaning(path, attributes)
     count = whole_number("count", document["accessors"][attributes["POSITION"]]["count"], 1)
-    compressed = (declared.get("extensions") or {}).get(_SPZ)
-    local = Y_UP if compressed else np.eye(4)  # an SPZ is read in the axes of a PLY
     try:
-        frame = Frame.of(Y_UP @ matrix @ local)
+        frame = Frame.of(Y_UP @ matrix)
     except ValueError as error:
         raise SceneError(f"{path}: {error}, by the transformation of its node. Export it without that.") from error
     tag = extras_tag(primitive.get("extras"), "the extras of the GLB")
-    if compressed:
-        start, size = _view(document, compressed["bufferView"], data)
-        spz = FileStart(path, read_bytes(path, start, start + min(size, _HEAD_BYTES)), size, start)
-        header = SPZ_3.read_header(spz)
-        if not SPZ_3.matches(spz) or header.count != count:
-            raise ValueError(f"SPZ of {header.count} Gaussians in place of {count}")
-        return GlbPart(count, {}, [], frame, tag if tag.reason else header.tag, linear, header)
-
     present = sum(name in attributes for name in _HARMONICS)
     coefficients = min(number for number in COEFFICIENTS.values() if number >= present)
     return GlbPart(
@@ -360,17 +334,13 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     for part in header.parts:
         arrays = {name: array[first : first + part.count] for name, array in into.items()}
         first += part.count
-        for name, convert in converters.items() if not part.spz else ():
+        for name, convert in converters.items():
             for block, values in _values(file, part.accessors[name], part.count):
                 arrays[name][block] = convert(values)
         for index, accessor in enumerate(part.harmonics):
             for block, values in _values(file, accessor, part.count):
                 arrays["sh_rest"][block, index] = values
-        arrays["sh_rest"][:, part.coefficients :] = 0
-        if part.spz:
-            within = {**arrays, "sh_rest": arrays["sh_rest"][:, : part.coefficients]}
-            assert SPZ_3.read is not None
-            SPZ_3.read(file, part.spz, within)
+        arrays["sh_rest"][:, len(part.harmonics) :] = 0
         part.frame.apply(arrays)
         if part.linear:
             _convert_linear(arrays)

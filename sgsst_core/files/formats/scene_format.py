@@ -64,13 +64,11 @@ class FileStart:
 
     Attributes:
         head: First bytes, at most `HEAD_BYTES`.
-        offset: Byte offset of the file if it is part of another one at `path`.
     """
 
     path: Path
     head: bytes
     size: int
-    offset: int = 0
 
 
 @dataclass(frozen=True)

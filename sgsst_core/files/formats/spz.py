@@ -112,7 +112,6 @@ class SpzHeader(SceneHeader):
     """Header of an SPZ file.
 
     Attributes:
-        offset: Byte offset of version 1 to 3 in the file, which may be a GLB.
         version: Version of the format, 1 to 4.
         fractional_bits: Fractional bits of the fixed-point positions; unused in version 1, which has 16-bit floats.
         degree: SH degree of the file, 0 to 4.
@@ -127,7 +126,6 @@ class SpzHeader(SceneHeader):
     """
 
     size: int
-    offset: int
     version: int
     degree: int
     fractional_bits: int
@@ -266,7 +264,7 @@ def _shared_fields(start: FileStart, head: bytes, least: int, versions: tuple[in
     drawn, extended = COEFFICIENTS[min(degree, 3)], bool(head[14] & _HAS_EXTENSIONS)
     notes = ("SH bands above degree 3 are left out",) if degree > 3 else ()
     return SpzHeader(
-        *(SPZ, count, drawn, start.size, start.offset, version, degree, fractional_bits, sections),
+        *(SPZ, count, drawn, start.size, version, degree, fractional_bits, sections),
         extended=extended,
         notes=notes,
     )
@@ -367,7 +365,7 @@ class _Stream:
     """
 
     def __init__(self, file: OpenScene, spz: SpzHeader) -> None:
-        self.source = _Part(file, spz.offset, spz.size)
+        self.source = _Part(file, 0, spz.size)
         self.inflate = zlib.decompressobj(31) if spz.zipped else None
 
     def read(self, count: int) -> bytes:

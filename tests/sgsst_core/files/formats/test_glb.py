@@ -12,7 +12,6 @@ import torch
 
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.glb import GLB
-from sgsst_core.files.formats.spz import SPZ_3
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
 from tests.sgsst_core.files.formats.samples import assert_close, check_documents, encoded, refused
@@ -237,12 +236,10 @@ def test_linear_colors_become_srgb(tmp_path: Path) -> None:
     document, data = split((tmp_path / "linear.glb").read_bytes())
     document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"] |= {
         "colorSpace": "lin_rec709_display",
-        "sharpness": 1,
     }
     (tmp_path / "linear.glb").write_bytes(joined(document, data))
     file = read_scene(tmp_path / "linear.glb")
     assert [note.partition(",")[0] for note in file.notes] == [
-        "sharpness of KHR_gaussian_splatting are unknown and ignored",
         "colors are linear",
     ]
     view = camera()
@@ -254,42 +251,12 @@ def test_linear_colors_become_srgb(tmp_path: Path) -> None:
     torch.testing.assert_close(srgb, expected, rtol=0, atol=2e-3)
 
 
-@pytest.mark.parametrize("node", [{}, {"translation": [1, 2, 3], "rotation": [0.6, 0, 0, 0.8], "scale": [2, 2, 2]}])
-def test_compressed_gaussians_are_read_as_others(tmp_path: Path, node: dict[str, Any]) -> None:
-    """The SPZ has the axes of its library, RUB; its Gaussians appear in those of glTF, LUF."""
-    plain, scene = tmp_path / "plain.glb", cloud(500, degree=2)
-    write_scene(tmp_path / "scene.spz", scene, SPZ_3)
-    write_scene(plain, read_scene(tmp_path / "scene.spz").scene, GLB)
-    document, data = split(plain.read_bytes())
-    document["nodes"][0] |= node
-    plain.write_bytes(joined(document, data))
-    blob = (tmp_path / "scene.spz").read_bytes()
-    blob = b"some" + blob + bytes(-len(blob) % 4)
-    primitive = document["meshes"][0]["primitives"][0]
-    primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] = {COMPRESSION: {"bufferView": 0}}
-    document |= {
-        "extensionsRequired": ["KHR_gaussian_splatting", COMPRESSION],
-        "accessors": [{key: each[key] for key in ("componentType", "count", "type")} for each in document["accessors"]],
-        "bufferViews": [{"buffer": 0, "byteOffset": 4, "byteLength": len(blob) - 4}],
-        "buffers": [{"byteLength": len(blob)}],
-    }
-    (tmp_path / "small.glb").write_bytes(joined(document, blob))
-    file = read_scene(tmp_path / "small.glb")
-    assert_close(file.scene, read_scene(plain).scene, opacities=1e-6, others=2e-5)
-    assert file.notes == ()
-    document["accessors"][0]["count"] = 499
-    refused(tmp_path, joined(document, blob), "SPZ of 500 Gaussians in place of 499", "wrong.glb")
-    document["bufferViews"][0]["byteLength"] += 1
-    refused(tmp_path, joined(document, blob), "bytes can hold", "wrong.glb")
-
-
 def test_checks_read_only_the_header(tmp_path: Path) -> None:
     document, data = split(encoded(tmp_path, GLB))
     (tmp_path / "scene").write_bytes(joined(document, bytes(len(data))))
     assert read_scene_header(tmp_path / "scene").count == 616
 
 
-COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
 MESH = {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}
 FIRST = "meshes__0__primitives__0__"
 
@@ -305,11 +272,11 @@ FIRST = "meshes__0__primitives__0__"
             by_hand(
                 **{
                     FIRST + "extensions__KHR_gaussian_splatting__extensions": {
-                        "KHR_gaussian_splatting_lgsc": {"bufferView": 0}
+                        "KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}
                     }
                 }
             ),
-            "KHR_gaussian_splatting_lgsc, which cannot be read",
+            "compression_spz_2, which cannot be read",
         ),
         (by_hand(**{FIRST + "extensions__KHR_gaussian_splatting__kernel": "box"}), "kernel 'box'"),
         (
