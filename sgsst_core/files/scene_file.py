@@ -246,12 +246,7 @@ def write_levels(target: Path, scene: Scene, original: Path) -> int:
         with zipfile.ZipFile(output, "w") as archive:
             write_recolored(original, header, arrays["means"], arrays["sh_dc"], archive)
         if to_folder:
-            with zipfile.ZipFile(output) as archive:
-                for info in archive.infolist():
-                    file = target.parent / info.filename
-                    file.parent.mkdir(parents=True, exist_ok=True)
-                    with atomic_path(file) as temporary:
-                        temporary.write_bytes(archive.read(info))
+            _unpack(output, target.parent)
     return sum(info.file_size for info in archive.infolist())
 
 
@@ -263,9 +258,16 @@ def write_sog_folder(folder: Path, scene: Scene) -> int:
     """
     stream = io.BytesIO()
     encode_scene(stream, scene, SOG, folder / META_NAME)
-    with zipfile.ZipFile(stream) as archive:
+    return _unpack(stream, folder)
+
+
+def _unpack(file: Path | BinaryIO, folder: Path) -> int:
+    """Write the files of an archive to a folder, in their order. Return their bytes."""
+    with zipfile.ZipFile(file) as archive:
         for entry in archive.infolist():
-            with atomic_path(folder / entry.filename) as temporary:
+            target = folder / entry.filename
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(target) as temporary:
                 temporary.write_bytes(archive.read(entry))
         return sum(entry.file_size for entry in archive.infolist())
 

@@ -155,18 +155,15 @@ class Camera:
 
 def _matrix(name: str, argument: str, values: Tensor | ArrayLike, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
     """Return an argument as a finite float64 matrix of one of the shapes."""
+    wanted = " or ".join(str(list(shape)) for shape in shapes)
     try:
         matrix = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
+        if matrix.shape in shapes and np.isfinite(matrix).all():
+            return matrix
+        problem = f"has shape {list(matrix.shape)}, or NaN or infinite values"
     except (TypeError, ValueError) as error:
-        raise CameraError(f"{name}: `{argument}` is not a matrix of numbers. Give a tensor or array.") from error
-    if matrix.shape not in shapes:
-        wanted = " or ".join(str(list(shape)) for shape in shapes)
-        raise CameraError(
-            f"{name}: `{argument}` has shape {list(matrix.shape)}. Give {wanted}, for one camera at a time."
-        )
-    if not np.isfinite(matrix).all():
-        raise CameraError(f"{name}: `{argument}` holds NaN or infinite values. Use other values.")
-    return matrix
+        problem = f"is not a matrix of numbers ({error})"
+    raise CameraError(f"{name}: `{argument}` {problem}. Give finite numbers {wanted}, for one camera at a time.")
 
 
 def checked_cameras(cameras: Sequence[Camera]) -> list[Camera]:

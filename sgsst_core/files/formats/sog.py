@@ -490,11 +490,8 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
     extras = meta["extras"] if isinstance(meta.get("extras"), dict) else {}
     model = meta.get("model", "antialiased" if meta.get("antialias") is True else "default")
     tag = extras_tag({**extras, "model": model}, "meta.json")
-    more = {name for name, value in meta.items() if isinstance(value, dict) and "files" in value} - names.keys()
-    notes = (f"{', '.join(sorted(more))[:80]} of meta.json are unknown and left out",) if more else ()
     return SogHeader(
         *(SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics, vectors),
-        notes=notes,
         tag=tag,
     )
 

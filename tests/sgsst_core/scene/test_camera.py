@@ -146,7 +146,7 @@ WRONG: dict[str, tuple[Any, Any, Any, str]] = {
     "mirrored": (MIRRORED, K, 990, "mirrors"),
     "transposed": (viewmat().T, K, 990, r"last row of `viewmat`.*transpose"),
     "batch": (torch.eye(4)[None], K, 990, r"shape \[1, 4, 4\].*one camera at a time"),
-    "nan": (torch.full((4, 4), torch.nan), K, 990, "holds NaN"),
+    "nan": (torch.full((4, 4), torch.nan), K, 990, "NaN or infinite"),
     "text": ("front", K, 990, "not a matrix of numbers"),
     "skew": (torch.eye(4), SKEWED, 990, "undistort"),
     "focal": (torch.eye(4), -K, 990, "above 0"),

@@ -115,11 +115,6 @@ def test_padding_may_have_any_colors(tmp_path: Path) -> None:
     assert read_scene(tmp_path / "scene.sog").notes == ()
 
 
-def test_unknown_images_are_noted(tmp_path: Path) -> None:
-    (tmp_path / "scene.sog").write_bytes(changed(normals={"files": ["low"]}, note="files"))
-    assert read_scene(tmp_path / "scene.sog").notes == ("normals of meta.json are unknown and left out",)
-
-
 def test_older_form_of_the_render_mode_is_read(tmp_path: Path) -> None:
     (tmp_path / "scene.sog").write_bytes(changed(antialias=True))
     assert read_scene(tmp_path / "scene.sog").scene.rendering.antialiased
