@@ -92,7 +92,7 @@ class Download:
             self.discard()
             self._done = 0
             self._expected = stated[0]
-            with disk_errors(self._target, self._part):
+            with disk_errors(self._target):
                 self._part.open("xb").close()
         self._size = self._done + int(response.headers.get("content-length", 0))
         return True
@@ -103,7 +103,7 @@ class Download:
         Raises:
             OutputError: If the disk is full.
         """
-        with disk_errors(self._target, self._part, self._size), self._part.open("ab") as file:
+        with disk_errors(self._target), self._part.open("ab") as file:
             file.write(block)
         self._done += len(block)
 

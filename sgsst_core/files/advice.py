@@ -15,6 +15,8 @@ _HEAD_BYTES = 4096
 _CHECKPOINT, _PICKLE = b"/data.pkl", (b"\x80\x02", b"\x80\x04", b"\x80\x05")
 #: Scenes in the folders of a run, in order of preference: of the original code, of gsplat, any, and an unpacked SOG.
 _SCENES_IN_RUNS = ("point_cloud/iteration_*/point_cloud.ply", "ply/*.ply", "*.ply", "meta.json")
+#: Checkpoints of gsplat and nerfstudio in the folders of a run.
+_CHECKPOINTS_IN_RUNS = ("ckpts/*_rank0.pt", "nerfstudio_models/*.ckpt")
 _AS_COLMAP = "Export the cameras as a COLMAP model, or give those that the scene was trained with."
 _TRANSFORMS = "--output-dir OUT` and give OUT/transforms.json."
 
@@ -255,18 +257,12 @@ def refuse_changed_meaning(path: Path, names: Iterable[str]) -> None:
 
 def refuse_scene_folder(folder: Path) -> NoReturn:
     """Raise a SceneError about a folder given as a scene: it names the scene in the folder, or how to export one."""
-    for pattern in _SCENES_IN_RUNS:
-        scene = max(folder.glob(pattern), key=_numbers, default=None)
-        if scene is not None:
-            raise SceneError(f"{folder}: is a folder. Give the scene in it: {scene}")
-    if any(folder.glob("nerfstudio_models/*.ckpt")):
-        command = f"ns-export gaussian-splat --load-config {folder / 'config.yml'} --output-dir exports"
-        raise SceneError(f"{folder}: is a run of nerfstudio. Export its scene: `{command}`.")
-    checkpoint = max(folder.glob("ckpts/*_rank0.pt"), key=_numbers, default=None)
-    if checkpoint is not None:
-        raise SceneError(
-            f"{folder}: is a run of gsplat without a PLY. Make one: `sgsst convert {checkpoint} scene.ply`."
-        )
+    for pattern in (*_SCENES_IN_RUNS, *_CHECKPOINTS_IN_RUNS):
+        found = max(folder.glob(pattern), key=_numbers, default=None)
+        if found is not None:
+            if pattern in _CHECKPOINTS_IN_RUNS:
+                raise SceneError(f"{folder}: is a folder. Make a scene of it: `sgsst convert {found} scene.ply`.")
+            raise SceneError(f"{folder}: is a folder. Give the scene in it: {found}")
     raise SceneError(f"{folder}: is a folder. Give the file of a scene.")
 
 

@@ -42,7 +42,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
         raise OutputError(f"{final}: is a folder. Name a file.")
     temporary = _reserve(final)
     try:
-        with disk_errors(target, temporary):
+        with disk_errors(target):
             yield temporary
             if final.exists():
                 shutil.copymode(final, temporary)
@@ -108,29 +108,19 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 
 
 @contextmanager
-def disk_errors(target: Path, temporary: Path, size: int = 0) -> Iterator[None]:
-    """Report a full disk in the block as an OutputError, with the needed and the available space if they are known.
-
-    Args:
-        target: File or folder that is named.
-        temporary: File or folder that is written in its place; the space that it takes counts as available.
-        size: Size of the complete file in bytes; 0 if it is unknown.
+def disk_errors(target: Path) -> Iterator[None]:
+    """Report a full disk in the block, which writes a file or folder, as an OutputError; raise other errors unchanged.
 
     Raises:
-        OutputError: If the disk is full. Other errors are raised unchanged.
+        OutputError: If the disk is full.
     """
     try:
         yield
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise
-        files = [temporary] if temporary.is_file() else temporary.rglob("*")
-        written = sum(path.stat().st_size for path in files)
-        needed = f"{size / 1e6:.2f} MB" if size else f"more than {written / 1e6:.2f} MB"
-        free = (shutil.disk_usage(temporary.parent).free + written) / 1e6
-        space = f" It takes {needed}, and {free:.2f} MB is free." if error.errno == errno.ENOSPC else ""
         raise OutputError(
-            f"{target}: cannot be written: {error.strerror}.{space} Free some space, or write to another disk."
+            f"{target}: cannot be written: {error.strerror}. Free some space, or write to another disk."
         ) from error
 
 

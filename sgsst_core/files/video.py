@@ -162,7 +162,7 @@ def _image_sequence(folder: Path, name: str) -> Iterator[Callable[[VideoFrame], 
         count += 1
 
     try:
-        with disk_errors(folder, temporary):
+        with disk_errors(folder):
             yield write
         for index in range(count):
             (temporary / (name % index)).replace(folder / (name % index))

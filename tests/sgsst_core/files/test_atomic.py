@@ -44,7 +44,7 @@ def test_full_disk_is_an_output_error(tmp_path: Path) -> None:
         with atomic_path(tmp_path / "a.ply"):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with pytest.raises(OutputError, match=r"a\.ply.*No space left on device. It takes more than .* MB is free"):
+    with pytest.raises(OutputError, match=r"a\.ply.*No space left on device. Free some space"):
         fail()
     assert os.listdir(tmp_path) == []
 

@@ -422,7 +422,7 @@ def test_checkpoints_are_refused_as_such(tmp_path: Path, legacy: bool) -> None:
         (["meta.json", "sh0.webp"], "Give the scene in it: {}/meta.json"),
         (
             ["config.yml", "nerfstudio_models/step-000029999.ckpt"],
-            "`ns-export gaussian-splat --load-config {}/config.yml --output-dir exports`",
+            "`sgsst convert {}/nerfstudio_models/step-000029999.ckpt scene.ply`",
         ),
         (
             ["ckpts/ckpt_6999_rank0.pt", "ckpts/ckpt_29999_rank0.pt", "ckpts/ckpt_29999_rank1.pt"],
