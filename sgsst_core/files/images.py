@@ -429,6 +429,7 @@ ASPECT_TOLERANCE = 0.01
 MAX_MISSING = 0.5
 
 _NAMES_IN_MESSAGE = 10
+_BY_NAME = "Files are found by the cameras' names, with or without extension: give the folder that holds exactly these."
 
 
 @dataclass(frozen=True)
@@ -547,27 +548,36 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
         ImageError: If a photo cannot be read or its aspect differs from its camera's, if more than half of the photos
             are missing, or if one is ambiguous. The message names the views.
     """
-    if not folder.is_dir():
-        raise ImageError(f"{folder}: is not a folder of photos. Give the folder that the cameras' names refer to.")
-    files = PhotoFolder(folder)
-    names = [photo_name(camera) for camera in cameras]
-    matches = [files.named(name) for name in names]
-    missing = [name for name, paths in zip(names, matches, strict=True) if not paths]
-    several = {name: paths for name, paths in zip(names, matches, strict=True) if len(paths) > 1}
-    by_name = (
-        "Photos are found by the cameras' names, with or without extension: give the folder that holds exactly these."
-    )
+    matches = _matches(folder, cameras, "photo")
+    missing = [photo_name(camera) for camera, paths in zip(cameras, matches, strict=True) if not paths]
     if len(missing) > MAX_MISSING * len(cameras):
         raise ImageError(
-            f"{folder}: holds no photo for {len(missing)} of {len(cameras)} views: {some_names(missing)}. {by_name}"
+            f"{folder}: holds no photo for {len(missing)} of {len(cameras)} views: {some_names(missing)}. {_BY_NAME}"
         )
+    return [_fitting(paths[0], camera) if paths else None for camera, paths in zip(cameras, matches, strict=True)]
+
+
+def _matches(folder: Path, cameras: Sequence[Camera], kind: str) -> list[list[Path]]:
+    """Return the file that matches each camera's name, or none.
+
+    Args:
+        kind: "photo" or "mask".
+
+    Raises:
+        ImageError: If there is no such folder, or a camera has several files.
+    """
+    if not folder.is_dir():
+        raise ImageError(f"{folder}: is not a folder of {kind}s. Give the folder that the cameras' names refer to.")
+    files = PhotoFolder(folder, masks=kind == "mask")
+    matches = [files.named(photo_name(camera)) for camera in cameras]
+    several = {photo_name(camera): paths for camera, paths in zip(cameras, matches, strict=True) if len(paths) > 1}
     if several:
         first = " and ".join(str(path.relative_to(folder)) for path in next(iter(several.values()))[:2])
         raise ImageError(
-            f"{folder}: holds more than one photo for {len(several)} of {len(cameras)} views: {some_names([*several])} "
-            f"(such as {first}). {by_name}"
+            f"{folder}: holds more than one {kind} for {len(several)} of {len(cameras)} views: "
+            f"{some_names([*several])} (such as {first}). {_BY_NAME}"
         )
-    return [_fitting(paths[0], camera) if paths else None for camera, paths in zip(cameras, matches, strict=True)]
+    return matches
 
 
 def check_names(folder: Path, names: Sequence[str], *, masks: bool = False) -> None:
@@ -601,15 +611,8 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     Raises:
         ImageError: If no camera has a mask, a camera has several, or the aspect of a mask differs from its camera's.
     """
-    if not folder.is_dir():
-        raise ImageError(f"{folder}: is not a folder of masks. Give the folder that the cameras' names refer to.")
-    files = PhotoFolder(folder, masks=True)
-    masks: list[Photo | None] = []
-    for camera in cameras:
-        paths = files.named(photo_name(camera))
-        if len(paths) > 1:
-            raise ImageError(f"{folder}: holds more than one mask for view {photo_name(camera)}. Leave one.")
-        masks.append(_fitting(paths[0], camera) if paths else None)
+    matches = _matches(folder, cameras, "mask")
+    masks = [_fitting(paths[0], camera) if paths else None for camera, paths in zip(cameras, matches, strict=True)]
     if not any(masks):
         raise ImageError(
             f"{folder}: holds no mask for any of {len(cameras)} views. Masks are found by the cameras' names, with or "

@@ -246,10 +246,8 @@ def _load(path: Path) -> Any:
             f"{path}: holds more than tensors and plain values. Such a file can run any program, so it is not loaded. "
             f"{_EXPORT}"
         ) from error
-    except (OSError, zipfile.BadZipFile) as error:
-        raise SceneError(f"{path}: cannot be read: {error}. Check the path.") from error
-    except (RuntimeError, ValueError, TypeError, KeyError, EOFError) as error:  # of PyTorch for damaged content
-        raise SceneError(f"{path}: is a damaged checkpoint ({str(error)[:100]}). Use an intact copy.") from error
+    except (OSError, zipfile.BadZipFile, RuntimeError, ValueError, TypeError, KeyError, EOFError) as error:
+        raise SceneError(f"{path}: is not a readable checkpoint ({str(error)[:100]}). Use an intact copy.") from error
 
 
 def _splats_in(path: Path, content: Any) -> tuple[dict[str, Any], Mapping[str, str]]:

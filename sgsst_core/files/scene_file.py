@@ -427,19 +427,11 @@ class SceneColumns:
                 valid[block] &= np.isfinite(array[block]).reshape(block.stop - block.start, -1).all(axis=1)
         if valid.all():
             return None
-        invalid = []
-        for name, values in self._targets.items():
-            numbers = {"NaN": np.isnan(values).sum(), "infinite": np.isinf(values).sum()}
-            kinds = [f"{number} {what}" for what, number in numbers.items() if number]
-            invalid += [f"{name} ({', '.join(kinds)})"] if kinds else []
-        unrotated = np.flatnonzero((self.arrays["quats"] == 0).all(axis=1))
+        flawed = [name for name, values in self._targets.items() if not np.isfinite(values).all()]
+        flawed += ["quaternions of length 0"] if (self.arrays["quats"] == 0).all(axis=1).any() else []
         bad = int((~valid).sum())
-        flawed = [f"hold NaN or infinite values: {', '.join(invalid)}"] if invalid else []
-        if len(unrotated):
-            flawed += [
-                f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {unrotated[0]})"
-            ]
-        summary = f"{path}: {bad} of {len(valid)} Gaussians {', or '.join(flawed)}"
+        summary = f"{path}: {bad} of {len(valid)} Gaussians hold NaN or infinite values or no rotation: "
+        summary += ", ".join(flawed)
         if surplus:
             raise SceneError(f"{summary}. Its rows are not as the header declares: {surplus[0]}.")
         if bad == len(valid):
@@ -730,15 +722,12 @@ def normalized(weights: Sequence[float]) -> list[float]:
         SettingsError: If a weight is not finite, their sum is not positive, or a result is larger than `MAX_WEIGHT`.
     """
     text = ", ".join(f"{weight:g}" for weight in weights)
-    if not all(math.isfinite(weight) and abs(weight) <= 1e100 for weight in weights):  # sums remain finite
-        raise SettingsError(f"The weights {text} are not all finite numbers. Give one for each scene, such as 0.7.")
-    total = math.fsum(weights)
-    if not total > 0:
-        raise SettingsError(f"The weights {text} have the sum {total:g}. Give weights whose sum is greater than 0.")
-    if max(map(abs, weights)) > MAX_WEIGHT * total:
+    usable = all(math.isfinite(weight) and abs(weight) <= 1e100 for weight in weights)  # sums remain finite
+    total = math.fsum(weights) if usable else 0.0
+    if not total > 0 or max(map(abs, weights)) > MAX_WEIGHT * total:
         raise SettingsError(
-            f"The weights {text} are too large for their sum {total:g}: each must be at most {MAX_WEIGHT:g} times as "
-            "large. Give weights closer to each other."
+            f"The weights {text} cannot be used. Give finite numbers whose sum is above 0, none of them more than "
+            f"{MAX_WEIGHT:g} times as large as the sum."
         )
     return [weight / total for weight in weights]
 

@@ -296,7 +296,7 @@ def test_non_finite_values_are_counted_by_property_or_dropped(tmp_path: Path, fo
     rows[1] |= {"scale_1": float("inf"), "f_rest_2": float("nan")}
     rows[3] |= {"scale_1": float("-inf")}
     path = save(tmp_path, file)
-    with pytest.raises(SceneError, match=r"2 of 5 .*scale_1 \(2 infinite\), f_rest_2 \(1 NaN\).*--drop-invalid"):
+    with pytest.raises(SceneError, match=r"2 of 5 .*scale_1, f_rest_2.*--drop-invalid"):
         read_scene(path)
     source = read_scene(path, drop_invalid=True)
     assert (len(source.scene), source.dropped) == (3, 2)
@@ -334,14 +334,10 @@ def test_zero_quaternions_are_refused_by_row_or_dropped(tmp_path: Path, form: st
     file.elements[0][2][2] |= dict.fromkeys(rotation, 0.0)
     file.elements[0][2][4] |= dict.fromkeys(rotation, 1e-60)  # nothing in float32
     path = save(tmp_path, file)
-    with pytest.raises(
-        SceneError, match=r"2 of 5 Gaussians have a quaternion of length 0.*first: Gaussian 2.*--drop-i"
-    ):
+    with pytest.raises(SceneError, match=r"2 of 5 Gaussians .*no rotation: quaternions of length 0.*--drop-i"):
         read_scene(path)
     file.elements[0][2][1]["x"] = float("nan")
-    with pytest.raises(
-        SceneError, match=r"3 of 5 Gaussians hold NaN .*x \(1 NaN\), or have .* \(2, first: Gaussian 2\)"
-    ):
+    with pytest.raises(SceneError, match=r"3 of 5 Gaussians hold NaN .*: x, quaternions of length 0"):
         read_scene(save(tmp_path, file))
     source = read_scene(path, drop_invalid=True)
     assert source.scene.means[:, 1].tolist() == [f32(0.01), f32(3.01)]

@@ -104,10 +104,10 @@ HOSTILE: dict[str, tuple[Callable[[Path, Path, dict[str, Any]], object], str]] =
         "`means` is larger than its data",
     ),
     "compressed": (lambda path, good, splats: repacked(good, path, zipfile.ZIP_DEFLATED), "compressed entries"),
-    "short": (lambda path, good, splats: repacked(good, path, cut=8), "damaged checkpoint"),
+    "short": (lambda path, good, splats: repacked(good, path, cut=8), "not a readable checkpoint"),
     "half": (
         lambda path, good, splats: path.write_bytes(good.read_bytes()[:5000]),
-        "cannot be read: File is not a zip file",
+        "not a readable checkpoint .File is not a zip file",
     ),
     "other": (
         lambda path, good, splats: torch.save({"model": splats}, path),

@@ -211,7 +211,7 @@ def test_invalid_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
     with pytest.raises(SceneError) as caught:
         read_scene(tmp_path / "scene.ply")
     assert "2 of 100" in str(caught.value)
-    assert "opacity (1 NaN), f_rest_0 (1 infinite), f_rest_17 (1 NaN)" in str(caught.value)
+    assert "opacity, f_rest_0, f_rest_17" in str(caught.value)
     source = read_scene(tmp_path / "scene.ply", drop_invalid=True)
     assert len(source.scene) == 98
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc + 1)
