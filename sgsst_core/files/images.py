@@ -71,6 +71,9 @@ _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 _BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
 #: Maximum length of a compressed text or profile of a PNG; Pillow's own limit, 1 MiB, is too low for some profiles.
 PngImagePlugin.MAX_TEXT_CHUNK = 16 << 20
+#: Maximum number of such texts and profiles, all of which Pillow inflates. Programs write less than ten.
+MAX_PNG_TEXTS = 64
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 class ImageWarning(UserWarning):
@@ -199,6 +202,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         with path.open("rb") as file:
             head = file.read(12)
+        if head.startswith(_PNG_SIGNATURE):
+            _check_texts(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
             opened = Image.open(path, formats=[*FORMATS, *_heif_format(path, head)])
@@ -235,6 +240,18 @@ def _check_scans(path: Path) -> None:
             position += max(2, int.from_bytes(data[position : position + 2], "big"))
         if scans > MAX_JPEG_SCANS:
             raise ImageError(f"{path}: is a progressive JPEG of more than {MAX_JPEG_SCANS} scans. Save it as PNG.")
+
+
+def _check_texts(path: Path) -> None:
+    """Check the number of compressed texts and profiles of a PNG file."""
+    texts = 0
+    with path.open("rb") as file:
+        file.seek(len(_PNG_SIGNATURE))
+        while len(header := file.read(8)) == 8:
+            texts += header[4:] in (b"zTXt", b"iTXt", b"iCCP")
+            if texts > MAX_PNG_TEXTS:
+                raise ImageError(f"{path}: is a PNG of more than {MAX_PNG_TEXTS} compressed texts. Save it without.")
+            file.seek(int.from_bytes(header[:4], "big") + 4, os.SEEK_CUR)
 
 
 def _heif_format(path: Path, head: bytes) -> tuple[str, ...]:

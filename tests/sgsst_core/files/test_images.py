@@ -20,6 +20,7 @@ from sgsst_core.files.images import (
     FORMATS,
     MAX_JPEG_SCANS,
     MAX_PIXELS,
+    MAX_PNG_TEXTS,
     MAX_PROFILE_BYTES,
     ColorProfile,
     ImageWarning,
@@ -129,8 +130,12 @@ def test_long_texts_are_skipped_and_text_bombs_refused(tmp_path: Path) -> None:
     ]
     path = with_chunks(save(tmp_path / "a.png", Image.fromarray(gradient())), *texts)
     assert torch.equal(load_image(path), torch.from_numpy(gradient()).float() / 255)
+    many = save(tmp_path / "b.png", Image.fromarray(gradient()))
+    with_chunks(with_chunks(many, *texts[3:4] * MAX_PNG_TEXTS), texts[3], behind=True)
     with_chunks(path, (b"zTXt", b"XML:com.adobe.xmp\0\0" + zlib.compress(bytes(17 << 20))))
     for read in (load_image, image_size):
+        with pytest.raises(ImageError, match=r"b\.png: is a PNG of more than 64 compressed texts"):
+            read(many)
         with pytest.raises(ImageError, match=r"a\.png: is truncated or corrupt \(Decompressed data too large"):
             read(path)
 
