@@ -101,8 +101,7 @@ def _only_json(folder: Path) -> Path:
     refuse_camera_folder(folder)
     if len(files) == 1:
         return files[0]  # its reader says what is wrong with it
-    looked_at = f" (looked at {', '.join(path.name for path in files)})" if files else ""
-    raise CameraError(f"{folder}: holds no cameras in a known format{looked_at}. Give {FORMATS}.")
+    raise CameraError(f"{folder}: holds no cameras in a known format. Give {FORMATS}.")
 
 
 def _json_files(folder: Path) -> list[Path]:

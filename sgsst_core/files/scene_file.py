@@ -206,7 +206,7 @@ def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY, axes: str =
 
 
 def losses(scene: Scene, format: SceneFormat) -> tuple[str, ...]:
-    """Return notes that count the Gaussians that a format cannot hold: values that it clips, or rounds too much."""
+    """Return notes that count the Gaussians whose values a format clips."""
     arrays, notes = arrays_of(scene), []
     scales = arrays["scales"].max(axis=1)  # a Gaussian that is thin in one axis looks the same
     for name, (low, high) in format.ranges.items():

@@ -72,12 +72,10 @@ def check_video_path(out: Path, *, alpha: bool = False) -> None:
             raise OutputError(f"{out}: is a folder. Name the video file to write, such as {out / 'video.mp4'}.")
         if alpha and suffix == ".mp4":
             raise OutputError(f"{out}: MP4 has no alpha channel. Name a .webm file or a folder for PNG images.")
-    elif _names_folder(out):
-        return
-    elif suffix == ".png" and not _PATTERN.fullmatch(out.name):
-        raise OutputError(f"{out}: names one image. Give a pattern such as frame_%04d.png, or a .mp4 file.")
-    elif suffix != ".png":
-        raise OutputError(f"{out}: is no video. Name a .mp4 or .webm file, a frame_%04d.png, or an existing folder.")
+    elif not _names_folder(out) and (suffix != ".png" or not _PATTERN.fullmatch(out.name)):
+        raise OutputError(
+            f"{out}: is no video. Name a .mp4 or .webm file, a pattern such as frame_%04d.png, or an existing folder."
+        )
 
 
 @contextmanager

@@ -177,14 +177,10 @@ def checked_cameras(cameras: Sequence[Camera]) -> list[Camera]:
             f"The cameras are a {type(cameras).__name__}, not a list of `Camera`. Read them with `load_cameras`, or "
             "make each with `Camera.from_matrix`."
         )
-    checked = []
     for camera in cameras:
-        transform = camera.world_to_camera
-        if not isinstance(transform, Tensor) or transform.shape != (4, 4):
+        if not isinstance(camera.world_to_camera, Tensor) or camera.world_to_camera.shape != (4, 4):
             raise CameraError(f"{camera.name}: its transform is not a [4, 4] tensor. Use `Camera.from_matrix`.")
-        exact = transform.to("cpu", torch.float64)
-        checked.append(camera if exact is transform else replace(camera, world_to_camera=exact))
-    return checked
+    return [replace(camera, world_to_camera=camera.world_to_camera.to("cpu", torch.float64)) for camera in cameras]
 
 
 def resized(camera: Camera, side: int) -> Camera:

@@ -264,27 +264,21 @@ def _accessor(
     entry = document["accessors"][attributes[name]]
     if entry["type"] != shape or entry["count"] != count or "sparse" in entry:
         raise ValueError(f"accessor of {name}: {entry}")
-    start, size = _view(document, entry["bufferView"], data)
+    view = document["bufferViews"][entry["bufferView"]]
+    if view.get("buffer") != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
+        raise ValueError(f"buffer view {entry['bufferView']} is not in the file, or compressed")
+    start = whole_number("byteOffset", view.get("byteOffset", 0))
+    size = whole_number("byteLength", view["byteLength"])
+    if start + size > len(data):
+        raise ValueError(f"buffer view {entry['bufferView']}: {view}, more than its {len(data)} bytes can hold")
     code = _TYPES[entry["componentType"]]
     kind = np.dtype((code, (_COMPONENTS[shape],)))
-    stride = whole_number("stride", document["bufferViews"][entry["bufferView"]].get("byteStride", kind.itemsize))
+    stride = whole_number("stride", view.get("byteStride", kind.itemsize))
     first = whole_number("byteOffset", entry.get("byteOffset", 0))
     if first + (count - 1) * stride + kind.itemsize > size or not kind.itemsize <= stride <= _MAX_STRIDE:
         raise ValueError(f"accessor of {name}: {count} values are more than its {size} bytes can hold")
     largest = _LARGEST.get(code) if entry.get("normalized", False) else None
-    return Accessor(start + first, stride, kind, largest)
-
-
-def _view(document: dict[str, Any], index: int, data: range) -> tuple[int, int]:
-    """Return the byte offset of a buffer view in the file, and its size, after checking that it lies in the data."""
-    view = document["bufferViews"][index]
-    if view.get("buffer") != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
-        raise ValueError(f"buffer view {index} is not in the file, or compressed")
-    start = whole_number("byteOffset", view.get("byteOffset", 0))
-    size = whole_number("byteLength", view["byteLength"])
-    if start + size > len(data):
-        raise ValueError(f"buffer view {index}: {view}, more than its {len(data)} bytes can hold")
-    return data.start + start, size
+    return Accessor(data.start + start + first, stride, kind, largest)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # the transformation is checked

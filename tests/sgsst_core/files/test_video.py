@@ -130,8 +130,8 @@ except OutputError as error:
     [
         ("video.mp4", True, "no alpha channel"),
         ("video.avi", False, "is no video"),
-        ("image.png", False, "names one image"),
-        ("100%_%d.png", False, "names one image"),
+        ("image.png", False, "is no video"),
+        ("100%_%d.png", False, "is no video"),
         (".", False, None),
     ],
 )

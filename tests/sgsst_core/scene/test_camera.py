@@ -163,7 +163,7 @@ def test_invalid_camera_matrices_are_refused(case: str) -> None:
 
 def test_cameras_of_callers_are_checked() -> None:
     good = camera()
-    assert checked_cameras([good])[0] is good
+    assert checked_cameras([good])[0].world_to_camera is good.world_to_camera
     single = replace(good, world_to_camera=good.world_to_camera.float())
     assert checked_cameras((single,))[0].world_to_camera.dtype == torch.float64
     for wrong in ("cameras.json", good, [good, "b"], torch.eye(4)[None]):
