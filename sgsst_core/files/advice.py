@@ -258,11 +258,11 @@ def refuse_changed_meaning(path: Path, names: Iterable[str]) -> None:
 def refuse_scene_folder(folder: Path) -> NoReturn:
     """Raise a SceneError about a folder given as a scene: it names the scene in the folder, or how to export one."""
     for pattern in (*_SCENES_IN_RUNS, *_CHECKPOINTS_IN_RUNS):
-        found = max(folder.glob(pattern), key=_numbers, default=None)
-        if found is not None:
+        path = max(folder.glob(pattern), key=_numbers, default=None)
+        if path is not None:
             if pattern in _CHECKPOINTS_IN_RUNS:
-                raise SceneError(f"{folder}: is a folder. Make a scene of it: `sgsst convert {found} scene.ply`.")
-            raise SceneError(f"{folder}: is a folder. Give the scene in it: {found}")
+                raise SceneError(f"{folder}: is a folder. Make a scene of it: `sgsst convert {path} scene.ply`.")
+            raise SceneError(f"{folder}: is a folder. Give the scene in it: {path}")
     raise SceneError(f"{folder}: is a folder. Give the file of a scene.")
 
 
