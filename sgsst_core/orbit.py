@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,9 +15,8 @@ from torch import Tensor
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
 from sgsst_core.progress import Decision
-from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene.camera import Camera, look_at, resized
-from sgsst_core.scene.gaussians import Scene, rotations, sampled, sampled_rows
+from sgsst_core.scene.camera import Camera, look_at
+from sgsst_core.scene.gaussians import Scene, rotations, sampled_rows
 
 #: Number of Gaussians sampled to compute the extent, which is then accurate to well under 1 %, and maximum number of
 #: points stored in a `Subject`.
@@ -262,8 +261,7 @@ def _standing(subject: Subject, axes: Tensor) -> Up | None:
     ends = [_foot(subject, long), _foot(subject, -long)]
     if max(ends) <= max(_MIN_FOOT, _WIDER * min(ends)):
         return None
-    broader = f"{max(ends) / min(ends):.1f} times as broad as" if max(ends) < 100 * min(ends) else "broader than"
-    reason = f"the subject is {longer:.1f} times as tall as wide, and its foot is {broader} the other end"
+    reason = f"the subject is {longer:.1f} times as tall as wide, and its foot is broader than the other end"
     return Up(_snapped(long if ends[0] > ends[1] else -long, _SNAP_STANDING), reason)
 
 
@@ -344,7 +342,7 @@ def _covered_fraction(points: Tensor, up: Tensor, rows: Tensor) -> float:
 
     Areas are counted in grid cells.
     """
-    flat = points @ _across(up)
+    flat = points @ _level_frame(up)[:, :2]
     low = flat.amin(0)
     side = float((flat.amax(0) - low).amax())
     if not side > 0:
@@ -378,7 +376,7 @@ def _balance(subject: Subject, up: Tensor) -> float:
 def _base(subject: Subject, up: Tensor, thickness: float) -> tuple[Tensor, Tensor]:
     """Return all points [P, 2] and the lowest ones, seen from above; `thickness` is a fraction of the height."""
     heights = subject.points @ up
-    flat = subject.points @ _across(up)
+    flat = subject.points @ _level_frame(up)[:, :2]
     # quantiles, so that neither strays nor the few points of a hollow base below its rim count as a foot
     low, high = (quantile(heights, subject.weights, fraction) for fraction in (0.01, 0.99))
     return flat, flat[heights <= low + thickness * (high - low)]
@@ -394,13 +392,15 @@ def _area(points: Tensor) -> float:
         return 0.0
 
 
-def _across(up: Tensor) -> Tensor:
-    """Return two unit vectors perpendicular to `up` and each other, [3, 2] as columns."""
+def _level_frame(up: Tensor) -> Tensor:
+    """Return unit vectors as columns [3, 3]: horizontally to the first camera, horizontally to its side, and up.
+
+    The first camera stands in the direction of world z, or of x if up is close to z.
+    """
     first = torch.zeros(3, dtype=torch.float64)
-    first[int(up.abs().argmin())] = 1.0
-    first = torch.linalg.cross(up, first)
-    first = first / first.norm()
-    return torch.stack([first, torch.linalg.cross(up, first)], dim=1)
+    first[2 if abs(float(up[2])) < 0.9 else 0] = 1.0
+    first = torch.nn.functional.normalize(first - (first @ up) * up, dim=0)
+    return torch.stack([first, torch.linalg.cross(up, first), up], dim=1)
 
 
 #: Default resolution of an orbit: its views have as many pixels as 1024x768.
@@ -423,8 +423,6 @@ _SMALLEST = 0.5
 _NEAR_MARGIN = 1.1
 #: Tangent of the maximum half field of view, for cameras that an explicit radius places inside the subject.
 _WIDEST = math.tan(math.radians(50))
-#: If the ratio of the subject's smaller to its larger horizontal spread is at least this, it has no broad side.
-_ROUND = 0.9
 
 
 def orbit(
@@ -464,7 +462,7 @@ def orbit(
     """
     axis = _checked(count, up, elevations, radius, (width, height))
     subject = scene if isinstance(scene, Subject) else find_subject(scene)
-    directions, middle = ring_directions(subject, count, axis, elevations), middle_of(subject, axis)
+    directions, middle = ring_directions(count, axis, elevations), middle_of(subject, axis)
     if radius is None:
         radius = _distance(subject.hull - middle, directions, axis, near)
     frames = []
@@ -510,7 +508,7 @@ def turntable(
         SettingsError: If a value is out of range; see `orbit`.
     """
     axis = _checked(count, up, (elevation,), radius, (side, side))
-    directions, middle = ring_directions(subject, count, axis, (elevation,)), middle_of(subject, axis)
+    directions, middle = ring_directions(count, axis, (elevation,)), middle_of(subject, axis)
     if radius is None:
         radius = _distance(subject.hull - middle, directions, axis, near)
     halves = [_half_extents(subject, middle + radius * direction, middle, axis, near) for direction in directions]
@@ -526,24 +524,19 @@ def turntable(
 
 
 def cameras_per_ring(count: int, elevations: Sequence[float]) -> list[int]:
-    """Distribute `count` cameras over the rings by circumference, at least one per ring if there are enough cameras."""
-    lengths = [math.cos(math.radians(elevation)) for elevation in elevations]
-    quotas = [count * length / sum(lengths) for length in lengths]
-    counts = [max(1, math.floor(quota)) for quota in quotas]
-    order = sorted(range(len(quotas)), key=lambda ring: math.floor(quotas[ring]) - quotas[ring])
-    for ring in order:
-        counts[ring] += sum(counts) < count
-    while sum(counts) > count:  # more rings than cameras
-        counts[max(range(len(counts)), key=lambda ring: (counts[ring], ring))] -= 1
+    """Distribute `count` cameras over the rings by circumference."""
+    lengths = np.cos(np.radians(elevations))
+    ends = np.rint(count * lengths.cumsum() / lengths.sum()).astype(int)
+    counts: list[int] = np.diff(ends, prepend=0).tolist()
     return counts
 
 
-def ring_directions(subject: Subject, count: int, up: Tensor, elevations: Sequence[float]) -> list[Tensor]:
+def ring_directions(count: int, up: Tensor, elevations: Sequence[float]) -> list[Tensor]:
     """Return unit vectors [3] from the center to the cameras, ring by ring.
 
     Every second ring is rotated by half the angle between its cameras.
     """
-    start, side, _ = _level_frame(subject, up).T
+    start, side, _ = _level_frame(up).T
     directions = []
     for ring, (number, elevation) in enumerate(zip(cameras_per_ring(count, elevations), elevations, strict=True)):
         tilt = math.radians(elevation)
@@ -559,15 +552,9 @@ def middle_of(subject: Subject, up: Tensor) -> Tensor:
 
     A median would be unsuitable: that of a standing figure, for example, is not at half its height.
     """
-    frame = _level_frame(subject, up)
+    frame = _level_frame(up)
     local = subject.hull @ frame
     return frame @ ((local.amin(0) + local.amax(0)) / 2)
-
-
-def _level_frame(subject: Subject, up: Tensor) -> Tensor:
-    """Return unit vectors as columns [3, 3]: horizontally to the first camera, horizontally to its side, and up."""
-    front = _front(subject, up)
-    return torch.stack([front, torch.linalg.cross(up, front), up], dim=1)
 
 
 def _checked(
@@ -590,26 +577,6 @@ def _checked(
         raise SettingsError(f"An orbit's radius is {radius:g}; give a number above 0.")
     unit: Tensor = axis / axis.norm()
     return unit
-
-
-def _front(subject: Subject, up: Tensor) -> Tensor:
-    """Return the horizontal direction [3] to the first camera, which faces the subject's broad side if it has one."""
-    start = torch.zeros(3, dtype=torch.float64)
-    start[2 if abs(float(up[2])) < 0.9 else 0] = 1.0  # any direction that is not (nearly) parallel to up
-    start = torch.nn.functional.normalize(start - (start @ up) * up, dim=0)
-    frame = torch.stack([start, torch.linalg.cross(up, start)], dim=1)
-    flat = (subject.points - subject.points[0]) @ frame
-    flat = flat - (subject.weights[:, None] * flat).sum(0)
-    flat = flat / flat.abs().amax().clamp_min(1e-300)
-    spreads, axes = torch.linalg.eigh((subject.weights[:, None] * flat).T @ flat)
-    if not float(spreads[0]) < _ROUND**2 * float(spreads[1]):
-        return start
-    # Of the two broad sides, take the one from which more protrudes; if they are similar, the one on the positive z
-    # side.
-    skew = float((subject.weights * (flat @ axes[:, 0]) ** 3).sum()) / max(float(spreads[0]), 1e-100) ** 1.5
-    sense = skew if abs(skew) > 0.05 else float(axes[0, 0]) or 1.0
-    level: Tensor = math.copysign(1.0, sense) * (frame @ axes[:, 0])
-    return level
 
 
 def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: float) -> float:
@@ -684,23 +651,13 @@ def _widened(half: tuple[float, float], shape: float) -> tuple[float, float]:
     return (max(x, y * shape), max(y, x / shape))
 
 
-#: Elevations in degrees of rings that may be added to the first. Rings below the horizon are only for an isolated
+#: Elevations in degrees of an orbit's rings, the most important first. Rings below the horizon are only for an isolated
 #: subject, without ground or background.
-_ABOVE, _BELOW = (40.0, 70.0), (-20.0,)
-#: Minimum fraction of the surface that a ring must add.
-_LITTLE = 0.03
+_RINGS = (ELEVATION, 40.0, 70.0, -20.0)
 #: Default number of views of a ring at elevation 0. All rings together then have 49 views.
 _AROUND = 16
 #: Minimum number of views per ring if there are several rings.
 _MIN_VIEWS = 6
-#: Fraction of its largest visible area from which on a surface counts as fully seen: that of a surface rotated by 45
-#: degrees.
-_ENOUGH = 0.7
-#: A surface counts as inside the scene if views show less than the first fraction of its area. The second is the
-#: maximum fraction of such surfaces without a warning.
-_HARDLY, _INSIDE = 0.02, 0.3
-#: Trial views: number in a ring at elevation 0, resolution, and number of sampled Gaussians.
-_TRIALS, _TRIAL_SIDE, _TRIAL_GAUSSIANS = 8, 160, 50_000
 
 
 @dataclass(frozen=True)
@@ -709,7 +666,7 @@ class OrbitRequest:
 
     Attributes:
         up: [3], world direction of up.
-        elevation: Elevation in degrees of the orbit's only ring; None to choose one or several rings.
+        elevation: Elevation in degrees of the orbit's only ring; None for as many rings as `count` suffices for.
         radius: Distance of the cameras from the center in world units.
     """
 
@@ -729,20 +686,14 @@ class Orbit:
         up: Up direction with its reason.
         elevations: Elevations of the rings in degrees.
         radius: Distance of the cameras from the center of the subject in world units.
-        tried: Elevations that were tried.
-        shown: Surface that the rings show, as a fraction of what all tried rings would show.
         outside: Fraction of the scene that is not part of the subject.
-        inside: Fraction of the surface that no trial view shows.
     """
 
     cameras: list[Camera]
     up: Up
     elevations: tuple[float, ...]
     radius: float
-    tried: tuple[float, ...]
-    shown: float
     outside: float
-    inside: float
 
 
 def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = None) -> Orbit:
@@ -750,29 +701,24 @@ def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = N
 
     Args:
         remaining: [N] bool, Gaussians of a cropped scene that the orbit surrounds; None for all. The others may still
-            hide them, and show where up is.
+            show where up is.
 
     Raises:
         SettingsError: If an option is out of range; see `orbit`.
     """
     subject, up = find_upright_subject(scene, request.up, remaining)
-    first = ELEVATION if request.elevation is None else request.elevation
-    rings = request.count // _MIN_VIEWS if request.count is not None else 1 + len(_ABOVE + _BELOW)
-    tried = [first]
-    if request.elevation is None and rings > 1:
-        alone = not up.ground and subject.left_out <= _WHOLE
-        tried += [*_ABOVE, *(_BELOW if alone else ())]
-    trial = _Trial(scene, subject, up, request, remaining)
-    areas = [trial.of_ring(elevation) for elevation in tried]
-    chosen, shown = _needed(areas, max(rings, 1))
-    elevations = tuple(tried[ring] for ring in chosen)
+    elevations: tuple[float, ...] = (request.elevation,) if request.elevation is not None else _RINGS
+    if request.elevation is None and (up.ground or subject.left_out > _WHOLE):
+        elevations = tuple(angle for angle in _RINGS if angle > 0)
+    if request.count is not None:
+        elevations = elevations[: max(1, request.count // _MIN_VIEWS)]
     count = request.count
     if count is None:
         count = sum(max(_MIN_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
-    cameras = trial.cameras(count, elevations)
+    axis, radius = up.direction.tolist(), request.radius
+    cameras = orbit(subject, count, up=axis, elevations=elevations, radius=radius, near=request.near)
     radius = float((cameras[0].center - middle_of(subject, up.direction)).norm())
-    inside = trial.hidden_fraction(areas)
-    return Orbit(cameras, up, elevations, radius, tuple(tried), shown, subject.left_out, inside)
+    return Orbit(cameras, up, elevations, radius, subject.left_out)
 
 
 def find_upright_subject(
@@ -800,95 +746,13 @@ def orbit_decisions(orbit: Orbit, count: int) -> list[Decision]:
     *others, last = [f"{angle:g}" for angle in orbit.elevations]
     angles = f"{', '.join(others)} and {last}" if others else last
     rings = f"{len(orbit.elevations)} rings" if len(orbit.elevations) > 1 else "a ring"
-    reason = "requested"
-    if len(orbit.tried) > 1:
-        tried = f"rings at {min(orbit.tried):g} to {max(orbit.tried):g} degrees"
-        reason = f"they show {orbit.shown:.0%} of the surface that {tried} show"
+    reason = "views from several heights show more of the surface" if others else "requested"
     views = f"{count} view{'s' if count > 1 else ''}"
     decisions.append(
         Decision("cameras", f"{views} in {rings} at {angles} degrees, {orbit.radius:.3g} from the center", reason)
     )
-    outside = f"{orbit.outside:.0%} of the scene lies outside the frames"
-    inside = f"{orbit.inside:.0%} of the scene lies inside, hidden from all views around it"
-    doubts = (
-        (orbit.outside > _WHOLE, outside, "it is not a single object"),
-        (orbit.inside > _INSIDE, inside, "it may be a room"),
-    )
-    for doubted, text, reason in doubts:
-        if doubted:
-            better = f"{reason}; the cameras of its capture (--cameras) would show it better"
-            decisions.append(Decision("subject", f"warning: {text}", better))
+    if orbit.outside > _WHOLE:
+        better = "it is not a single object; the cameras of its capture (--cameras) would show it better"
+        text = f"warning: {orbit.outside:.0%} of the scene lies outside the frames"
+        decisions.append(Decision("subject", text, better))
     return decisions
-
-
-class _Trial:
-    """Renderer of small trial views of a scene, or of an enlarged sample of its Gaussians, for comparing rings."""
-
-    def __init__(self, scene: Scene, subject: Subject, up: Up, request: OrbitRequest, remaining: Tensor | None) -> None:
-        self._subject, self._up, self._request = subject, up, request
-        colorless = replace(scene, sh_rest=scene.means.new_zeros((len(scene), 0, 3)))
-        self._scene = sampled(colorless, _TRIAL_GAUSSIANS)
-        self._rasterizer = make_rasterizer("cpu", self._scene, near=request.near)
-        self._cropped = None if remaining is None else ~remaining[sampled_rows(len(scene), _TRIAL_GAUSSIANS)]
-
-    def cameras(self, count: int, elevations: Sequence[float]) -> list[Camera]:
-        """Return the cameras of the orbit with these rings."""
-        axis, request = self._up.direction.tolist(), self._request
-        return orbit(self._subject, count, up=axis, elevations=elevations, radius=request.radius, near=request.near)
-
-    def hidden_fraction(self, areas: Sequence[Tensor]) -> float:
-        """Return the fraction of the surface that is hidden from all rings, given the areas [n] that each shows."""
-        lengths = self._scene.scales.double().clamp(-60, 60).exp().sort(dim=1).values
-        surface = 2 * math.pi * torch.sigmoid(self._scene.opacities.double()) * lengths[:, 1] * lengths[:, 2]
-        if self._cropped is not None:
-            surface[self._cropped] = 0
-        shown = torch.stack(list(areas)).amax(0)
-        return float(surface[shown < _HARDLY * surface].sum() / surface.sum().clamp_min(1e-300))
-
-    def of_ring(self, elevation: float) -> Tensor:
-        """Return the visible area of each Gaussian in the trial view of a ring that shows most of it, [n].
-
-        Areas are in squared world units.
-        """
-        count = max(4, round(_TRIALS * math.cos(math.radians(elevation))))
-        areas = torch.zeros(len(self._scene), dtype=torch.float64)
-        for camera in self.cameras(count, [elevation]):
-            small = resized(camera, _TRIAL_SIDE)
-            weights = self._rasterizer.survey(small)[1].double()
-            depths = self._scene.means.double() @ small.world_to_camera[2, :3] + small.world_to_camera[2, 3]
-            # area of a pixel at this depth, perpendicular to the view
-            areas = torch.maximum(areas, weights * (depths / small.fx) ** 2)
-        if self._cropped is not None:
-            areas[self._cropped] = 0
-        return areas
-
-
-def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float]:
-    """Choose rings greedily: the first one, then repeatedly the one that adds most surface, until the gain is small.
-
-    For each Gaussian, the view that shows most of it counts. The surface that a set of rings shows is the sum of these
-    areas, relative to that of all rings. A Gaussian counts fully if a ring shows at least the fraction `_ENOUGH` of its
-    largest area, and in proportion below that.
-
-    Args:
-        areas: Areas [n] for each ring.
-        most: Maximum number of rings to choose.
-
-    Returns:
-        Indices of the chosen rings, ascending, and fraction of the surface that they show.
-    """
-    best_of_all = torch.stack(list(areas)).amax(0)
-    areas = [(area / _ENOUGH).minimum(best_of_all) for area in areas]
-    total = float(best_of_all.sum()) or 1.0
-    chosen, covered = [0], areas[0]
-    while True:
-        gains = {
-            ring: float((torch.maximum(covered, areas[ring]) - covered).sum()) / total
-            for ring in range(len(areas))
-            if ring not in chosen
-        }
-        best = max(gains, key=lambda ring: gains[ring], default=None)
-        if best is None or gains[best] < _LITTLE or len(chosen) >= most:
-            return sorted(chosen), float(covered.sum()) / total
-        chosen.append(best)
-        covered = torch.maximum(covered, areas[best])
