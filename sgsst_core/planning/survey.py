@@ -57,14 +57,12 @@ class Survey:
         covered: Indices of the views that see anything.
         regions: Rectangle of each view that contains all covered pixels.
         uncovered_fraction: Fraction of uncovered pixels in the views that see anything.
-        uncovered: Fraction of uncovered pixels of each view, 1 if nothing is seen.
     """
 
     total_blend_weights: Tensor
     covered: list[int]
     regions: list[Rectangle]
     uncovered_fraction: float
-    uncovered: list[float]
 
 
 def survey_views(
@@ -105,7 +103,6 @@ def survey_views(
         covered,
         [views[index][0] for index in range(len(cameras))],
         sum(views[index][1] for index in covered) / sum(pixels[index] for index in covered),
-        [views[index][1] / pixels[index] if views[index][2] else 1.0 for index in range(len(cameras))],
     )
 
 

@@ -65,7 +65,7 @@ def facts(
     return Facts(
         gaussians=gaussians,
         sizes=(size,) * views,
-        survey=Survey(weights, list(range(views)), regions, uncovered, [uncovered] * views),
+        survey=Survey(weights, list(range(views)), regions, uncovered),
         machine=machine,
         **given,
     )

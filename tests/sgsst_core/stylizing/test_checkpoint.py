@@ -54,7 +54,7 @@ def state() -> StylizerState:
 def full_checkpoint(state: StylizerState) -> Checkpoint:
     seen = torch.tensor([True, True, False, True, True])
     regions = [Rectangle(0, 1, 2, 3), Rectangle(4, 5, 6, 7)]
-    survey = Survey(torch.rand(5, dtype=torch.float64), [0, 2], regions, 1 / 3, [0.0, 1 / 3])
+    survey = Survey(torch.rand(5, dtype=torch.float64), [0, 2], regions, 1 / 3)
     pieces = torch.tensor([[1, 1, 1], [3, 1, 1]], dtype=torch.uint8)
     plan = Plan(
         survey=survey,
