@@ -32,19 +32,17 @@ from benchmarks.equal_steps import judge_and_loss, judged
 from benchmarks.job_parts import command_seconds
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.report.charts import (
-    X_MARGIN,
+from sgsst_core.report.images import color_of
+from sgsst_core.report.page import (
     column,
     draw_legend,
     draw_points,
-    log_limits,
     png_chart,
     round_length,
     running_mean,
     set_log_x,
     set_log_y,
 )
-from sgsst_core.report.images import color_of
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.settings import PresetName
 from sgsst_core.stylizing.steps import BEFORE_STEPS, relative_loss
@@ -276,7 +274,7 @@ def _draw(axes: Axes, runs: Runs, key: str) -> None:
         low, high = ([each(row[key] for row in rows) for rows in own] for each in (min, max))
         axes.vlines(x, low, high, color=color_of(index), linewidth=1)
     every = [row for rows in runs.values() for row in rows]
-    set_log_x(axes, log_limits(column([row["seconds"] for row in every]), X_MARGIN), "seconds from the command")
+    set_log_x(axes, column([row["seconds"] for row in every]), "seconds from the command")
     set_log_y(axes, [column([row[key] for row in every])])
 
 

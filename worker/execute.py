@@ -239,8 +239,7 @@ def _write_reports(
     stylizer, outputs = job.stylizer, job.outputs
     try:
         # Matplotlib scans all fonts when it is first imported on a machine, for which no step should wait.
-        from sgsst_core.report.charts import write_loss_chart
-        from sgsst_core.report.page import write_page
+        from sgsst_core.report.page import write_loss_chart, write_page
 
         attenuated = stylizer.job.settings.sh_attenuation and job.scene_file.scene.sh_degree
         if job.request.colors and _has_rows_of_file(job) and not attenuated:  # only f_dc changes

@@ -29,21 +29,19 @@ from sgsst_core.planning.plan import LOSS_VIEWS
 from sgsst_core.quality.judge import MIN_SIDE, Judge, Judgment, VggLpips, load_lpips_or_none, load_vgg_lpips_or_none
 from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
 from sgsst_core.quality.novel_views import Consistency, NovelViewMoment
-from sgsst_core.report.charts import (
+from sgsst_core.report.images import INK, color_of, write_grid
+from sgsst_core.report.page import (
     RELATIVE_LOSS,
-    X_MARGIN,
     Floats,
     column,
     draw_legend,
     draw_points,
     joined,
-    log_limits,
     png_chart,
     scale_name,
     set_log_x,
     set_log_y,
 )
-from sgsst_core.report.images import INK, color_of, write_grid
 from sgsst_core.scales import ratio
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
@@ -328,7 +326,7 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str, value: Callabl
     for index, curve in enumerate(curves):
         options = {"marker": _MARKERS[index % len(_MARKERS)], "color": color_of(index), "label": curve.variant.name}
         draw_points(axes, seconds[index], values[index], markersize=4, linewidth=1, **options)
-    set_log_x(axes, log_limits(joined(seconds), X_MARGIN), "seconds of optimization")
+    set_log_x(axes, joined(seconds), "seconds of optimization")
     axes.set_title(title)
     return joined(values)
 

@@ -1,23 +1,31 @@
-"""HTML page of a report with its tables: one self-contained file."""
+"""HTML page of a report: one self-contained file with tables and a chart of the loss, which is written as a PNG too."""
 
 from __future__ import annotations
 
 import base64
-import json
-from collections.abc import Callable, Sequence
+import io
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
+import matplotlib
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from numpy.typing import NDArray
 
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.progress import NOTHING, byte_count, duration, number, percent
-from sgsst_core.report.charts import AGAINST, BINS, draw_figure, round_length
-from sgsst_core.report.images import PAGE
+from sgsst_core.report.images import GRID, INK, PAGE, color_of
 
-#: Fields of a report that have a section of their own on the page.
-_SECTIONS = ("history", "novel_views", "approximations", "loss_over_time", "findings", "plan", "seconds_by_part")
 _STOPPED = {
     "finished": "all planned steps are done",
     "within": "stopped when its time budget was used up",
@@ -66,21 +74,16 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         sheet: Contact sheet as JPEG; None omits it.
         views: Sheet of all views as JPEG; None omits it.
     """
-    caption, drawings = draw_figure(report)
     return _ENVIRONMENT.get_template("report.html").render(
         report=report,
         scene=PurePath(report["scene"]["path"]).name,
         style=_style_names(report),
         stopped=_STOPPED.get(report["stopped"], report["stopped"]),
         colors=PAGE,
-        against=AGAINST,
-        bins=BINS,
         round_length=round_length(report),
-        caption=caption,
-        drawings={name: _base64(svg) for name, svg in drawings.items()},
+        chart=_base64(_loss_svg(report)) if report["history"] else None,
         tables={name: table(report) for name, table in TABLES.items()},
         parts=_time_split(report),
-        everything=_everything(report),
         sheet=_base64(sheet) if sheet else None,
         views=_base64(views) if views else None,
     )
@@ -122,16 +125,6 @@ def _time_split(report: dict[str, Any]) -> list[tuple[str, float, float]]:
     total = sum(by_part.values())
     ordered = sorted(by_part.items(), key=lambda part: (part[0] == "other", -part[1]))
     return [(_PARTS.get(name, name), seconds, 100 * seconds / total) for name, seconds in ordered] if total else []
-
-
-def _everything(report: dict[str, Any]) -> str:
-    """Return all fields without a section of their own as JSON."""
-    fields = {field: value for field, value in report.items() if field not in _SECTIONS}
-    if report.get("novel_views"):
-        fields["novel_views"] = {
-            name: value for name, value in report["novel_views"].items() if name not in ("moments", "judged")
-        }
-    return json.dumps(fields, indent=2, ensure_ascii=False)
 
 
 @dataclass(frozen=True)
@@ -224,10 +217,9 @@ def _prediction_table(report: dict[str, Any]) -> Table:
     rows: list[list[str]] = []
     for title, text, name in values:
         before, after = predicted.get(name), measured.get(name)
-        if not before and not after:
-            continue
-        ratio = after / before if before and after is not None else None
-        rows.append([title, text(before), text(after), number(ratio)])
+        if before or after:
+            ratio = after / before if before and after is not None else None
+            rows.append([title, text(before), text(after), number(ratio)])
     return Table(["", "predicted", "measured", "measured / predicted"], rows)
 
 
@@ -249,14 +241,18 @@ def _finding_table(report: dict[str, Any]) -> Table | None:
 
 def _approximation_table(report: dict[str, Any]) -> Table | None:
     """Return all comparisons of the job's gradient with the exact one; None if there are none."""
-    rows = []
-    for entry in (report.get("approximations") or {}).get("moments") or []:
-        taken, exact = entry.get("seconds"), entry.get("seconds_exact")
-        row = [f"{entry['step']:,}", entry["view"]]
-        row += [number(entry.get("relative_error")), number(entry.get("cosine"), 6), duration(taken), duration(exact)]
-        rows.append([*row, number(exact / taken if taken and exact is not None else None)])
+    moments = (report.get("approximations") or {}).get("moments") or []
+    rows = [
+        [
+            f"{entry['step']:,}",
+            entry["view"],
+            *(number(entry["relative_error"]), number(entry["cosine"], 6)),
+            *(duration(entry["seconds"]), duration(entry["seconds_exact"])),
+        ]
+        for entry in moments
+    ]
     errors = ["relative error of the gradient", "cosine to the exact gradient"]
-    return Table(["step", "view", *errors, "time", "exact time", "speedup"], rows, ["view"]) if rows else None
+    return Table(["step", "view", *errors, "time", "exact time"], rows, ["view"]) if rows else None
 
 
 #: Tables of the page by their name in its template.
@@ -269,3 +265,198 @@ TABLES: dict[str, Callable[[dict[str, Any]], Table | None]] = {
     "findings": _finding_table,
     "approximations": _approximation_table,
 }
+
+
+Floats = NDArray[np.float64]
+#: Range of values on logarithmic axes. matplotlib searches for ticks some decades beyond it, which must fit float64
+#: too.
+_MIN, _MAX = 1e-200, 1e200
+#: Factor by which the x axis extends beyond the first and the last step.
+X_MARGIN = 1.05
+#: Style of all charts, for `matplotlib.rc_context`.
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "report",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.5,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": INK,
+    "axes.titlesize": 9.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": GRID,
+    "grid.alpha": 0.25,
+    "grid.linewidth": 0.6,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+}
+#: Label of the y axis of loss charts.
+RELATIVE_LOSS = "loss, relative to the unstylized scene"
+#: Size in inches of the chart of the page. At this width, text is legible on a phone.
+_SIZE = (5.6, 3.5)
+
+
+def relative_losses(report: dict[str, Any]) -> dict[int, Floats]:
+    """Return the loss of each optimized scale relative to the unstylized scene, [steps]; NaN for missing values."""
+    records, before = report["history"], report["loss"]["before"]["scales"]
+    relative = {}
+    for scale in sorted({int(scale) for record in records for scale in record["scales"]}):
+        start = column([(before.get(str(scale)) or {}).get("total")])
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            relative[scale] = column([record["scales"].get(str(scale), {}).get("total") for record in records]) / start
+    return relative
+
+
+def round_length(report: dict[str, Any]) -> int:
+    """Return the number of steps in which every view is visited once."""
+    views: int = report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"])
+    views_per_step: int = report["settings"].get("views_per_step", 1)
+    return max(1, math.ceil(views / views_per_step))
+
+
+def column(values: Sequence[float | None]) -> Floats:
+    """Return values as an array [n], with NaN for None."""
+    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def joined(columns: Sequence[Floats]) -> Floats:
+    """Concatenate columns; the list may be empty."""
+    return np.concatenate([np.empty(0), *columns])
+
+
+def _drawable(values: Floats) -> NDArray[np.bool_]:
+    """Return the mask [n] bool of the values that a logarithmic axis can show."""
+    return np.isfinite(values) & (values >= _MIN) & (values <= _MAX)
+
+
+def log_limits(values: Floats, margin: float) -> tuple[float, float]:
+    """Return the limits of a logarithmic axis that shows the values; arbitrary limits if there is nothing to show."""
+    shown = values[_drawable(values)]
+    if not len(shown):
+        return 0.1, 1.0
+    low, high = float(shown.min()), float(shown.max())
+    margin = 2.0 if high < 1.0001 * low else margin
+    return low / margin, high * margin
+
+
+def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
+    """Return the geometric mean of the last `window` values at each index, or of all values so far if there are fewer.
+
+    The last mean is that of the last window, as in `scales.smoothed`.
+    """
+    logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
+    sums = np.concatenate([[0.0], np.cumsum(logs)])
+    end = np.arange(1, len(logs) + 1)
+    start = np.maximum(end - window, 0)
+    means: Floats = np.exp((sums[end] - sums[start]) / (end - start))
+    return means
+
+
+def _draw_loss(figure: Figure, report: dict[str, Any]) -> None:
+    """Draw the loss of each scale and their mean against seconds, relative to the start.
+
+    Lines are running means over one round of views, with the losses of single steps behind. A dotted line ends the
+    phase on the coarsest scale.
+    """
+    axes, records = figure.subplots(), report["history"]
+    seconds = column([record["seconds"] for record in records])
+    lines = [(scale_name(scale), values, color_of(scale)) for scale, values in relative_losses(report).items()]
+    if len(lines) > 1:
+        several = [record["relative"] if len(record["scales"]) > 1 else None for record in records]
+        lines.append(("mean", column(several), INK))
+    for label, values, color in lines:
+        shown = _drawable(seconds) & _drawable(values)
+        x, y = seconds[shown], values[shown]
+        axes.plot(x, y, color=color, alpha=0.3, linewidth=0.5)
+        means = running_mean(y, round_length(report))
+        axes.plot(x, means, color=color, label=label, marker="o" if len(x) == 1 else None)
+    coarse = [record["seconds"] for record in records if record["stage"] == "coarse"]
+    if 0 < len(coarse) < len(records):
+        axes.axvline(coarse[-1], color=INK, linewidth=0.8, linestyle=":")
+    set_log_x(axes, seconds, "seconds")
+    set_log_y(axes, [values for _, values, _ in lines])
+    axes.set_ylabel(RELATIVE_LOSS)
+    draw_legend(figure)
+
+
+def _loss_svg(report: dict[str, Any]) -> bytes:
+    """Return the chart of the loss as SVG."""
+    with matplotlib.rc_context(STYLE):
+        figure, file = Figure(figsize=_SIZE, layout="constrained"), io.BytesIO()
+        _draw_loss(figure, report)
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    return file.getvalue()
+
+
+def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
+    """Write the chart of the loss as a PNG.
+
+    Args:
+        report: Report from `build_report`; its history may be empty.
+    """
+    with png_chart(path, (8, 4.8), dpi=120) as figure:
+        _draw_loss(figure, report)
+
+
+@contextmanager
+def png_chart(path: Path, size: tuple[float, float], dpi: int = 110) -> Iterator[Figure]:
+    """Provide a figure of a size in inches to a `with` block, and write it as a PNG afterwards."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=size, dpi=dpi, layout="constrained")
+        yield figure
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, format="png")
+
+
+def scale_name(scale: int) -> str:
+    """Return the display name of a scale."""
+    return f"scale {scale} (1/{1 << scale})" if scale else "scale 0 (full size)"
+
+
+def draw_points(axes: Axes, x: Floats, values: Floats, **options: Any) -> None:
+    """Draw points [n] that may lie on the border of the axes; do nothing if `x` is empty.
+
+    matplotlib's layout would extend an empty, unclipped line to the corner of the figure.
+    """
+    if len(x):
+        axes.plot(x, values, clip_on=False, **options)
+
+
+def set_log_x(axes: Axes, values: Floats, label: str) -> None:
+    """Make the x axis logarithmic, with limits that include the values [n]."""
+    limits = log_limits(values, X_MARGIN)
+    axes.set(xscale="log", xlim=limits, xlabel=label)
+    _set_ticks(axes.xaxis, limits)
+
+
+def set_log_y(axes: Axes, drawn: Sequence[Floats]) -> None:
+    """Make the y axis logarithmic, with limits that include all drawn arrays [n]."""
+    limits = log_limits(joined(drawn), 1.2)
+    axes.set(yscale="log", ylim=limits)
+    _set_ticks(axes.yaxis, limits)
+
+
+def _set_ticks(axis: Axis, limits: tuple[float, float]) -> None:
+    """Set ticks with plain numbers: at decades, also at 2 and 5 if decades are few, and linearly within one decade."""
+    decades = math.log10(limits[1]) - math.log10(limits[0])
+    axis.set_minor_locator(NullLocator())
+    if decades < 0.8:
+        axis.set_major_locator(MaxNLocator(4))
+    else:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if decades < 2.2 else (1,), numticks=8))
+        axis.set_minor_locator(LogLocator(subs="auto", numticks=8))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def draw_legend(figure: Figure, in_row: int = 3) -> None:
+    """Draw a legend below the figure, with each label once; do nothing if there are no labels."""
+    named: dict[str, Artist] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    if named:
+        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), in_row))

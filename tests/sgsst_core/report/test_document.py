@@ -14,10 +14,9 @@ from api.cli.console import loss_text
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.progress import percent
-from sgsst_core.report.charts import history_of, running_mean
 from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, loss_over_time
 from sgsst_core.report.images import write_contact_sheet
-from sgsst_core.report.page import render_page
+from sgsst_core.report.page import relative_losses, render_page, round_length, running_mean
 from sgsst_core.scales import smoothed
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import Stopped, run
@@ -107,12 +106,11 @@ def test_loss_after_is_the_mean_of_the_last_round_everywhere(
     last = [record.loss for record in stylizer.history[-length:]]
     wanted = math.prod(last) ** (1 / length)
     assert mean_loss(after) == pytest.approx(wanted) == pytest.approx(round_loss(stylizer.history, length))
-    history = history_of(report)
-    assert history.round_length == length
+    assert round_length(report) == length
     relative = wanted / mean_loss(before)
     assert report["loss"]["relative"] == pytest.approx(relative)
     assert report["loss_over_time"]["relative"] == pytest.approx(relative)
-    assert running_mean(history.relative[0], length)[-1] == pytest.approx(relative)
+    assert running_mean(relative_losses(report)[0], length)[-1] == pytest.approx(relative)
     coarse = [StepRecord(1, "coarse", 0, 0.1, 4.0, {1: LossTerms(gram=4.0)}, {}, 0)]
     steps = [StepRecord(n, "sos", 0, 0.1, loss, {0: LossTerms(gram=loss)}, {}, 0) for n, loss in ((2, 1.0), (3, 4.0))]
     assert round_loss(coarse + steps, 5) == pytest.approx(2), "of the current phase only"
