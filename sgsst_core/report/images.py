@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate, zip_longest
+from itertools import zip_longest
 from pathlib import Path
 from typing import Literal
 
@@ -51,11 +51,8 @@ _MAX_CELL_WIDTH = 520
 _GAP = 12
 _LABEL = 18
 _LINE = _LABEL + _GAP
-#: Image of a sheet: its left and top edge, the image, and its label, which stands above it.
-_Cell = tuple[int, int, Image.Image, str]
-#: Sheet of views without a style: maximum number of views, their longer side, aspect ratio of the sheet, and maximum
-#: number of Gaussians.
-_MAX_VIEWS, _VIEW_SIDE, _SHEET_SHAPE, _VIEW_GAUSSIANS = 48, 240, 1.6, 250_000
+#: Sheet of views without a style: maximum number of views, their longer side, and maximum number of Gaussians.
+_MAX_VIEWS, _VIEW_SIDE, _VIEW_GAUSSIANS = 48, 240, 250_000
 
 
 def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
@@ -65,11 +62,10 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
     with torch.no_grad():
         for index in stylizer.job.evaluation_views:
             camera = views.cameras[index]
-            name = camera.name if len(camera.name) <= 24 else "…" + camera.name[-23:]
             # Call the rasterizer directly, because only one rank writes the sheet and the other ranks do not render.
             before, after = views.scene.sh_dc.to(rasterizer.device), stylizer.shown()
             original = rasterizer.render(views.colors(index, before), camera)
-            originals.append((f"{name}: original", _fitted(original)))
+            originals.append((f"original: {camera.name}", _fitted(original)))
             results.append(("stylized", _fitted(rasterizer.render(views.colors(index, after), camera))))
     styles = [("style", _fitted(image)) for style in stylizer.job.styles.all for image in style.images]
     _save_grid(path, [[style, *(row or ())] for style, row in zip_longest(styles, (originals, results))])
@@ -90,14 +86,8 @@ def write_views(
     shown = spread(cameras, _MAX_VIEWS)
     renders = small_renders(scene, shown, _VIEW_SIDE, background=background, near=near)
     images = [(camera.name, to_image(render)) for camera, render in zip(shown, renders, strict=True)]
-    width = max(image.width for _, image in images) + _GAP
-    height = max(image.height for _, image in images) + _LINE
-    columns = min(len(images), max(1, round(math.sqrt(_SHEET_SHAPE * len(images) * height / width))))
-    cells: list[_Cell] = []
-    for index, (name, image) in enumerate(images):
-        row, column = divmod(index, columns)
-        cells.append((_GAP + column * width, _LINE + row * height, image, name))
-    _save(path, cells)
+    columns = math.ceil(math.sqrt(len(images)))
+    _save_grid(path, [images[start : start + columns] for start in range(0, len(images), columns)])
 
 
 def small_renders(
@@ -122,30 +112,23 @@ def write_grid(path: Path, rows: Sequence[Sequence[tuple[str, Tensor] | None]]) 
 
 
 def _save_grid(path: Path, grid: Sequence[Sequence[tuple[str, Image.Image] | None]]) -> None:
-    """Write a sheet of rows of images; see `write_grid`."""
+    """Write a JPEG with rows of images; see `write_grid`. Labels that are wider than their image lose their end."""
     widths = [max((cell[1].width for cell in column if cell), default=0) for column in zip_longest(*grid)]
-    lefts = [_GAP, *(_GAP + end for end in accumulate(width + _GAP for width in widths))]
-    cells: list[_Cell] = []
-    top = _LINE
-    for row in grid:
-        cells += [(left, top, cell[1], cell[0]) for left, cell in zip(lefts, row, strict=False) if cell]
-        top += max((cell[1].height for cell in row if cell), default=0) + _LINE
-    _save(path, cells)
-
-
-def _save(path: Path, cells: Sequence[_Cell]) -> None:
-    """Write a sheet of images as a JPEG that is large enough for all of them."""
-    width, height = (
-        max(left + image.width for left, _, image, _ in cells),
-        max(top + image.height for _, top, image, _ in cells),
-    )
-    sheet = Image.new("RGB", (width + _GAP, height + _GAP), PAPER)
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=_LABEL - 4)
-    for left, top, image, label in cells:
-        sheet.paste(image, (left, top))
-        while label and draw.textlength(label, font) > image.width:  # narrow portrait views
-            label = label[:-1]
-        draw.text((left, top - _LABEL), label, INK, font)
+    heights = [max((cell[1].height for cell in row if cell), default=0) for row in grid]
+    size = sum(widths) + _GAP * (len(widths) + 1), sum(heights) + _LINE * len(heights) + _GAP
+    sheet = Image.new("RGB", size, PAPER)
+    draw, font, top = ImageDraw.Draw(sheet), ImageFont.load_default(size=_LABEL - 4), _LINE
+    for row, height in zip(grid, heights, strict=True):
+        left = _GAP
+        for cell, width in zip(row, widths, strict=False):
+            label, image = cell or ("", None)
+            if image is not None:
+                sheet.paste(image, (left, top))
+                while draw.textlength(label, font) > image.width:  # narrow portrait views
+                    label = label[:-1]
+                draw.text((left, top - _LABEL), label, INK, font)
+            left += width + _GAP
+        top += height + _LINE
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
 
