@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +23,15 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.scene_file import losses, read_scene
 from sgsst_core.loss.sos import make_loss
-from sgsst_core.loss.terms import has_statistics, layers_of
+from sgsst_core.loss.terms import layers_of
 from sgsst_core.planning.survey import psnr
-from sgsst_core.quality.judge import Judge, Lpips, load_lpips_or_none
-from sgsst_core.quality.novel_views import NovelViews
-from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.quality.judge import Judge, Lpips, PerceptualMetric, load_lpips_or_none
+from sgsst_core.quality.novel_views import MAX_VIEWS, NovelViews
+from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import WHOLE_FLOAT32, StyleLossName
-from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.steps import Evaluation, ShowViews, evaluate, show_nothing
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views, ViewTargets
@@ -104,54 +103,28 @@ class Measurements:
     @cached_property
     def _novel_views(self) -> NovelViews:
         """Novel views of the job."""
-        stylizer, scene = self._stylizer, self._stylizer.job.scene.without_zero_bands()
-        # Features that define Gram distances are float32, and have Gram statistics even if the job optimizes another
-        # loss.
-        source: StylizationJob | ExactLoss = stylizer.job
-        if not has_statistics(stylizer.job.settings.style_loss):
-            source = ExactLoss(stylizer, "sos")
-        elif stylizer.job.plan.precision not in WHOLE_FLOAT32:
-            source = self.exact
-        rasterizer = _rasterizer_beside(stylizer, scene)
-        return make_novel_views(
-            stylizer,
-            scene,
-            rasterizer,
-            source,
-            lpips=load_lpips_or_none(stylizer.job.network.device),
-            most=stylizer.job.plan.novel_views,
-            rasterizer_of=partial(_rasterizer_beside, stylizer),
-            maps=stylizer.job.styles.maps(rasterizer),
-        )
+        job = self._stylizer.job
+        return make_novel_views(self._stylizer, lpips=load_lpips_or_none(job.network.device), most=job.plan.novel_views)
 
 
-def make_novel_views(
-    stylizer: Stylizer,
-    scene: Scene | None = None,
-    rasterizer: Rasterizer | None = None,
-    source: StylizationJob | ExactLoss | None = None,
-    **options: Any,
-) -> NovelViews:
-    """Create the novel views of a job.
-
-    Args:
-        scene: Scene to show; None for that of the job.
-        rasterizer: Rasterizer of the scene; None for one beside the job's.
-        source: Loss and targets of the Gram distance; None for the paper's loss in float32.
-        options: Further arguments of `NovelViews`.
-    """
-    job = stylizer.job
-    scene, source = scene or job.scene, source or ExactLoss(stylizer, "sos")
+def make_novel_views(stylizer: Stylizer, *, lpips: PerceptualMetric | None = None, most: int = MAX_VIEWS) -> NovelViews:
+    """Create the novel views of a job; their Gram distance is that of the paper's loss in float32 for every job."""
+    job, source = stylizer.job, ExactLoss(stylizer, "sos")
+    scene = job.scene.without_zero_bands()
+    own = job.views.rasterizer.uncached  # caches the latest tile intersections only
+    rasterizer = own.for_scene(scene, **own.options(0))
     return NovelViews(
         job.views.cameras,
         job.views.covered,
         scene,
-        rasterizer or _rasterizer_beside(stylizer, scene),
+        rasterizer,
         source.loss,
         source.style_targets,
         weighted=job.plan.weighted,
+        lpips=lpips,
+        most=most,
         memory=memory_for("measuring", job.memory),
-        **options,
+        maps=job.styles.maps(rasterizer),
     )
 
 
@@ -170,12 +143,6 @@ def approximations(stylizer: Stylizer) -> list[str]:
     if stylizer.job.plan.cached_weights == "half":
         names.append("half-precision blend weights")
     return names
-
-
-def _rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
-    """Create a rasterizer of another scene with the job's settings, which caches the latest tile intersections only."""
-    own = stylizer.job.views.rasterizer.uncached
-    return own.for_scene(scene, **own.options(0))
 
 
 @dataclass(frozen=True)

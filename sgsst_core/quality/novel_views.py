@@ -27,10 +27,9 @@ from sgsst_core.loss.terms import StyleTargets
 from sgsst_core.planning.survey import sees_something
 from sgsst_core.quality.judge import MIN_SIDE, PerceptualMetric, shown
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.rasterizer.base import CameraKey, camera_key
 from sgsst_core.regions import RegionMaps
-from sgsst_core.scene.camera import Camera, between, moved, nearest_walk, resized, similarly_rotated, spread
-from sgsst_core.scene.gaussians import Scene, sampled
+from sgsst_core.scene.camera import Camera, between, moved, nearest_walk, similarly_rotated, spread
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.steps import ShowViews, show_nothing
 from sgsst_core.stylizing.views import ViewColors
 
@@ -81,7 +80,6 @@ class NovelViews:
         lpips: LPIPS network; None skips LPIPS.
         most: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
         memory: Memory budget in bytes for coverage, colors, warps and images. What does not fit is recomputed.
-        rasterizer_of: Function that creates a rasterizer for a sample of the Gaussians; see `_choose_novel_cameras`.
         maps: Region maps that match `style_targets`; None if the scene has no regions.
 
     Attributes:
@@ -105,7 +103,6 @@ class NovelViews:
         lpips: PerceptualMetric | None = None,
         most: int = MAX_VIEWS,
         memory: int = 1 << 29,
-        rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
         maps: RegionMaps | None = None,
     ) -> None:
         self.scene = scene
@@ -123,9 +120,14 @@ class NovelViews:
             coarsest=loss.tiling.coarsest,
             scales=loss.weights,
         )
-        self.cameras, self.views, self.pairs = _choose_novel_cameras(
-            [cameras[index] for index in covered], scene, rasterizer, most=most, rasterizer_of=rasterizer_of
-        )
+        self.cameras = [between(*pair) for pair in neighbors([cameras[index] for index in covered])]
+        chosen = {gap: view_pairs(len(self.cameras), gap, most) for gap in (SHORT_RANGE, LONG_RANGE)}
+        # Use the first views of the short-range pairs: they are rendered anyway, and spread just as evenly.
+        views = [first for first, _ in chosen[SHORT_RANGE]] or list(range(min(len(self.cameras), most)))
+        used = {*views, *(index for pairs in chosen.values() for pair in pairs for index in pair)}
+        seeing = {index for index in used if sees_something(rasterizer.coverage(self.cameras[index]))}
+        self.views = [index for index in views if index in seeing]
+        self.pairs = {gap: [pair for pair in pairs if seeing.issuperset(pair)] for gap, pairs in chosen.items()}
         self._colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 8)
         self._coverage: Cache[int, Tensor] = Cache(memory // 8, tensor_bytes)
         self._warps: Cache[tuple[int, int], Warp] = Cache(memory // 2, lambda warp: warp.nbytes)
@@ -446,19 +448,6 @@ def _mean(values: Sequence[float | None]) -> float | None:
 #: Distance, relative to the median distance of consecutive cameras, beyond which two cameras are not neighbors. The
 #: capture was probably interrupted between them.
 JUMP = 4.0
-#: Maximum factor by which the median depth and the coverage of a novel view may lie outside the range of its neighbors'
-#: values. They exceed it inside an object or behind a wall. On the chord between two cameras of a 60-degree arc, they
-#: change by at most a third.
-LIKENESS = 2.0
-#: Longer side in pixels of the small renders that are checked for depth and coverage.
-_OUTLOOK_SIDE = 160
-#: Maximum number of Gaussians in these renders. Larger scenes are sampled, and sampled Gaussians are enlarged to cover
-#: the same area.
-_OUTLOOK_GAUSSIANS = 250_000
-
-
-#: Mean coverage of a view (0 if it sees nothing), and its median depth (None if unknown).
-Outlook = tuple[float, float | None]
 
 
 def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
@@ -488,66 +477,3 @@ def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
 
     in_order = pairs(range(len(cameras)))
     return in_order if 2 * len(in_order) >= len(cameras) - 1 else max(in_order, pairs(walk), key=len)
-
-
-def _choose_novel_cameras(
-    cameras: list[Camera],
-    scene: Scene,
-    rasterizer: Rasterizer,
-    *,
-    most: int,
-    rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
-) -> tuple[list[Camera], list[int], dict[int, list[tuple[int, int]]]]:
-    """Place a camera halfway between neighbors, and choose what to measure: evenly spread, never inside an object.
-
-    Args:
-        cameras: Cameras of the job that see at least one Gaussian.
-        most: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
-        rasterizer_of: Function that creates a rasterizer for a sample of the Gaussians, used to check depth and
-            coverage in large scenes; None uses the whole scene.
-
-    Returns:
-        All novel cameras, the indices of the views whose Gram distance is measured (if there are none, there is nothing
-        to measure), and pairs of views to compare, by gap.
-    """
-    parents = neighbors(cameras)
-    novel = [between(*pair) for pair in parents]
-    pairs = {gap: view_pairs(len(novel), gap, most) for gap in (SHORT_RANGE, LONG_RANGE)}
-    # Use the first views of the short-range pairs: they are rendered anyway, and spread just as evenly.
-    views = [i for i, _ in pairs[SHORT_RANGE]] or list(range(min(len(novel), most)))
-    used = {*views, *(index for chosen in pairs.values() for pair in chosen for index in pair)}
-    if rasterizer_of is not None and len(scene) > _OUTLOOK_GAUSSIANS:
-        scene = sampled(scene, _OUTLOOK_GAUSSIANS)
-        rasterizer = rasterizer_of(scene)
-    outlooks: dict[CameraKey, Outlook] = {}  # by camera, because a camera is a neighbor of two views
-
-    def outlook(camera: Camera) -> Outlook:
-        key, small = camera_key(camera), resized(camera, min(_OUTLOOK_SIDE, camera.side))
-        if key not in outlooks:
-            coverage, depth = rasterizer.coverage(small), expected_depth(scene, small, rasterizer)
-            known = depth.depth[depth.known]
-            covered = float(coverage.mean()) if sees_something(coverage) else 0.0
-            outlooks[key] = covered, float(known.median()) if len(known) else None
-        return outlooks[key]
-
-    clear = {index for index in used if _is_clear(novel[index], parents[index], outlook)}
-    return (
-        novel,
-        [index for index in views if index in clear],
-        {gap: [pair for pair in chosen if clear.issuperset(pair)] for gap, chosen in pairs.items()},
-    )
-
-
-def _is_clear(camera: Camera, parents: tuple[Camera, Camera], outlook: Callable[[Camera], Outlook]) -> bool:
-    """Return whether depth and coverage of a novel view resemble its neighbors', unlike inside an object."""
-    (covered, depth), *others = (outlook(view) for view in (camera, *parents))
-    return (
-        covered > 0
-        and _alike(covered, [other[0] for other in others])
-        and (depth is None or _alike(depth, [other[1] for other in others if other[1] is not None]))
-    )
-
-
-def _alike(value: float, others: list[float]) -> bool:
-    """Return whether a value is within `LIKENESS` of the range of `others`; true if `others` is empty."""
-    return not others or min(others) / LIKENESS <= value <= LIKENESS * max(others)
