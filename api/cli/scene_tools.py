@@ -27,7 +27,7 @@ from sgsst_core.files.scene_file import SceneFile, normalized, read_scene, write
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.progress import Decision, warnings_of
-from sgsst_core.quality.findings import Finding, findings_of, render_mode_findings
+from sgsst_core.quality.findings import Finding, findings_of
 from sgsst_core.quality.study import VoteShare, check_names, write_study
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import machine, plan_json
@@ -141,8 +141,7 @@ def look_for_extremes(source: SceneRequest, style: Path | None) -> list[Finding]
     about = [
         Finding("views", f"{line.item}: {line.decision}", count, count, "", line.reason) for line in capture.decisions
     ]
-    modes = render_mode_findings(file, capture.cameras, near=source.near)
-    return [*about, *modes, *findings_of(file, capture.cameras, image, near=source.near)]
+    return [*about, *findings_of(file, capture.cameras, image, near=source.near)]
 
 
 # --- render --------------------------------------------------------------------------------------------------------

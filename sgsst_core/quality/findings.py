@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -18,13 +18,10 @@ from torch import Tensor
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.planning.survey import Survey, survey_views
-from sgsst_core.quality.measure import scene_psnr
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.projection import Column, Shapes, project
-from sgsst_core.scene.camera import Camera, spread
+from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import style_size
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.rendering import Rendering
 from sgsst_core.style import Style
 
 #: Size relative to the scene's extent above which a Gaussian is larger than the scene.
@@ -38,13 +35,6 @@ FAR_WORLD = 1e4
 FLAT_STYLE = 1.0 / 255.0
 #: Number of Gaussians from which the scene's extent is estimated.
 _SAMPLE = 50_000
-#: Number of views that are compared between render modes.
-_VIEWS = 8
-#: Opacity above which a Gaussian counts as opaque, and factor of compensation below which it is small: at 0.5, its area
-#: is about a third of that of the blur.
-_OPAQUE, _SMALL = 0.5, 0.5
-#: Fraction of small ones among the opaque Gaussians of a view, above which a scene that states no mode is reported.
-_MANY = 0.2
 
 Subject = Literal["scene", "views", "style"]
 
@@ -167,36 +157,3 @@ def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
             Finding("style", "too small for deep layers", 1, 1, f"used at {smallest[1]} x {smallest[0]}", done)
         )
     return findings
-
-
-def render_mode_findings(file: SceneFile, cameras: Sequence[Camera], *, near: float) -> list[Finding]:
-    """Return a finding if a scene that states no render mode may need the antialiased one."""
-    scene, views = file.scene, spread(list(cameras), min(_VIEWS, len(cameras)))
-    if scene.rendering.antialiased or file.tag.reason or not views:
-        return []
-    small, opaque = small_gaussians(scene, views, near)
-    if small <= _MANY * opaque:
-        return []
-    other = Rendering("antialiased", scene.rendering.eps2d)
-    psnr = scene_psnr(scene, replace(scene, rendering=other), views, near=near)
-    differ = "the same renders as" if psnr is None else f"{psnr:.1f} dB PSNR against"
-    worst = f"{differ} {other.text}, in {len(views)} views"
-    done = "drawn classic; if the scene was trained with antialiasing, add --render-mode antialiased"
-    what = "opaque but smaller than a pixel, as in antialiased scenes; the file states no mode"
-    return [Finding("scene", what, small, opaque, worst, done)]
-
-
-def small_gaussians(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[int, int]:
-    """Return the numbers of small opaque Gaussians, and of opaque ones, as means over views."""
-    scene = replace(scene, rendering=replace(scene.rendering, mode="classic"))
-    compensated = replace(scene, rendering=replace(scene.rendering, mode="antialiased"))
-    shapes, counts = Shapes.of(scene), []
-    for camera in cameras:
-        opacity, after = np.zeros(len(scene)), np.zeros(len(scene))
-        for each, values in ((scene, opacity), (compensated, after)):
-            projection = project(each, camera, near=near, shapes=shapes)
-            values[projection.gaussians] = np.exp2(projection.values[:, Column.LOG2_OPACITY])
-        opaque = opacity > _OPAQUE
-        counts.append((int((opaque & (after < _SMALL * opacity)).sum()), int(opaque.sum())))
-    small, total = np.mean(counts, axis=0).round().astype(int)
-    return int(small), int(total)

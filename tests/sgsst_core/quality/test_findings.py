@@ -1,4 +1,4 @@
-"""Tests of `sgsst check` on scenes, views and styles, each with one extreme property, and of the PSNR of scenes."""
+"""Tests of `sgsst check` on scenes, views and styles, each with one extreme property."""
 
 import math
 from dataclasses import replace
@@ -12,20 +12,13 @@ from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.quality.findings import (
     Finding,
-    render_mode_findings,
     scene_findings,
-    small_gaussians,
     style_findings,
     view_findings,
 )
-from sgsst_core.quality.measure import scene_psnr
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.projection import project
-from sgsst_core.rasterizer.reference import splat
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.rendering import CLASSIC, Rendering
-from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -118,48 +111,3 @@ def test_extreme_styles_are_reported() -> None:
     (tiny,) = style_findings(torch.rand(8, 9, 3), views)
     assert tiny.worst == "used at 9 x 8"
     assert style_findings(torch.rand(1000, 50, 3), views) == []
-
-
-AA = Rendering("antialiased")
-VIEWS = [camera(), camera(pose=rotated_pose())]
-
-
-def dust(tmp_path: Path, rendering: Rendering = CLASSIC, log_scale: float = -4.0) -> Path:
-    """Write a scene of opaque Gaussians that are smaller than a pixel."""
-    scene = cloud(600, log_scale=log_scale)
-    write_scene(tmp_path / "dust.ply", replace(scene, opacities=torch.full((600,), 2.0), rendering=rendering))
-    return tmp_path / "dust.ply"
-
-
-def test_scene_of_small_opaque_gaussians_may_be_antialiased(tmp_path: Path) -> None:
-    file = read_scene(dust(tmp_path))
-    (finding,) = render_mode_findings(file, VIEWS, near=0.2)
-    assert "states no mode" in finding.what
-    assert finding.done.endswith("add --render-mode antialiased")
-    expected = scene_psnr(file.scene, replace(file.scene, rendering=AA), VIEWS, near=0.2)
-    assert finding.worst == f"{expected:.1f} dB PSNR against antialiased, eps2d 0.3, in 2 views"
-
-
-def test_scenes_of_other_sizes_or_with_a_statement_are_not_reported(tmp_path: Path) -> None:
-    assert render_mode_findings(read_scene(dust(tmp_path, log_scale=-1.0)), VIEWS, near=0.2) == []
-    path = dust(tmp_path)
-    path.write_bytes(path.read_bytes().replace(b"element", b"comment SplatRenderMode: default\nelement", 1))
-    assert render_mode_findings(read_scene(path), VIEWS, near=0.2) == []
-    assert render_mode_findings(read_scene(dust(tmp_path, AA)), VIEWS, near=0.2) == []
-
-
-def test_counts_are_those_of_the_reference() -> None:
-    scene = replace(cloud(2000, log_scale=-3.0), opacities=torch.linspace(-2, 4, 2000))
-    small = opaque = 0
-    for view in VIEWS:
-        visible = set(project(scene, view).gaussians.tolist())
-        plain, after = splat(scene, view), splat(replace(scene, rendering=AA), view)
-        left = dict(zip(after.gaussians.tolist(), after.opacity.tolist(), strict=True))
-        for index, opacity in zip(plain.gaussians.tolist(), plain.opacity.tolist(), strict=True):
-            if opacity > 0.5 and index in visible:
-                opaque += 1
-                small += left.get(index, 0.0) < 0.5 * opacity
-    counts = small_gaussians(scene, VIEWS, 0.2)
-    assert 0 < small < opaque
-    # The projection leaves out small ones between pixel centers, which the reference keeps.
-    assert (counts[1], counts[0]) == (pytest.approx(opaque / 2, abs=1), pytest.approx(small / 2, rel=0.02))
