@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from torch import Tensor
 
 from sgsst_core.errors import ImageError, SettingsError
 
+#: Vincent van Gogh, The Starry Night, 1889, which comes with the program: 800x633 JPEG, in the public domain.
+STARRY_NIGHT = Path(__file__).parent / "paintings" / "starry_night.jpg"
 #: Accepted dtypes of images.
 _DTYPES = (torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 #: Numbers of channels of gray, RGB and RGBA images.

@@ -24,7 +24,6 @@ from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, write_json
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.scene_file import SceneFile, normalized, read_scene, write_scene, write_stylized
-from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.progress import Decision, warnings_of
 from sgsst_core.quality.findings import Finding, findings_of
@@ -34,6 +33,7 @@ from sgsst_core.report.document import machine, plan_json
 from sgsst_core.report.images import write_views
 from sgsst_core.scene.camera import Camera, faces_to_render, join_faces, level, resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
+from sgsst_core.style import STARRY_NIGHT
 from worker.capture import orbit_request
 from worker.derived import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture

@@ -44,13 +44,13 @@ from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.images import image_size
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from sgsst_core.orbit import find_upright_subject
-from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.survey import OTHER_FRAME
 from sgsst_core.progress import Progress, warnings_of
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene import kernels as scene_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.style import STARRY_NIGHT
 from sgsst_core.stylizing.checkpoint import versions
 from sgsst_core.stylizing.planner import estimate
 from worker.capture import choose_axes, orbit_request

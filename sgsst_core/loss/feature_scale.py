@@ -21,8 +21,8 @@ from torch import Tensor
 
 from sgsst_core.features.network_weights import CAFFE_MEAN, BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, FeatureNetwork
-from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.settings import FeatureScale, Settings
+from sgsst_core.style import STARRY_NIGHT
 
 #: Factor of every layer except the first, for feature scale `even`. With this factor, Gram matrix, mean and standard
 #: deviation contribute about equally to the loss at the start of a job.

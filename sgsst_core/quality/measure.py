@@ -65,46 +65,38 @@ class Measurements:
 
     def at_the_end(self) -> None:
         """Measure the unstylized scene and the result, and judge both."""
-        if self._stylizer.job.plan.novel_views:
-            with self._stylizer.measuring():
-                self._stylizer.measured = self._measured()
+        stylizer, most = self._stylizer, self._stylizer.job.plan.novel_views
+        if not most:
+            return
+        with stylizer.measuring():
+            novel_views = make_novel_views(stylizer, lpips=load_lpips_or_none(stylizer.job.network.device), most=most)
+            moments, errors = [], []
+            for start in (True, False):
+                if self.approximated:
+                    errors.append(asdict(self.exact.gradient_error(start=start)))
+                if novel_views.views:
+                    moment = novel_views.measure(stylizer.job.scene.sh_dc if start else stylizer.stylized(), self._show)
+                    moments.append(moment.as_dict(0, 0.0) if start else moment.as_dict(stylizer.step, stylizer.seconds))
+            between = {
+                "views": [novel_views.cameras[index].name for index in novel_views.views],
+                "lpips": novel_views.lpips.network if novel_views.lpips else None,
+                "moments": moments,
+                "judged": _judged(stylizer, novel_views),
+            }
+            stylizer.measured = {
+                "novel_views": between if moments else None,
+                "approximations": {"what": self.approximated, "moments": errors} if errors else None,
+            }
 
-    def _measured(self) -> dict[str, Any]:
-        """Return the fields `novel_views` and `approximations` of the report."""
-        stylizer, novel_views = self._stylizer, self._novel_views
-        moments, errors = [], []
-        for start in (True, False):
-            if self.approximated:
-                errors.append(asdict(self.exact.gradient_error(start=start)))
-            if novel_views.views:
-                moment = novel_views.measure(stylizer.job.scene.sh_dc if start else stylizer.stylized(), self._show)
-                moments.append(moment.as_dict(0, 0.0) if start else moment.as_dict(stylizer.step, stylizer.seconds))
-        between = {
-            "views": [novel_views.cameras[index].name for index in novel_views.views],
-            "lpips": novel_views.lpips.network if novel_views.lpips else None,
-            "moments": moments,
-            "judged": self._judged(),
-        }
-        return {
-            "novel_views": between if moments else None,
-            "approximations": {"what": self.approximated, "moments": errors} if errors else None,
-        }
 
-    def _judged(self) -> dict[str, Any] | None:
-        """Return the judgments of the unstylized scene and of the result; None without AlexNet, or if not rank 0."""
-        stylizer, novel_views = self._stylizer, self._novel_views
-        if not isinstance(novel_views.lpips, Lpips) or stylizer.job.collectives.rank:
-            return None
-        judge = make_judge(stylizer, novel_views, novel_views.lpips)
-        colors = {"before": stylizer.job.scene.sh_dc, "after": stylizer.stylized()}
-        judgments = {name: judge.judge(sh_dc) for name, sh_dc in colors.items()}
-        return {name: asdict(one) for name, one in judgments.items() if one} or None
-
-    @cached_property
-    def _novel_views(self) -> NovelViews:
-        """Novel views of the job."""
-        job = self._stylizer.job
-        return make_novel_views(self._stylizer, lpips=load_lpips_or_none(job.network.device), most=job.plan.novel_views)
+def _judged(stylizer: Stylizer, novel_views: NovelViews) -> dict[str, Any] | None:
+    """Return the judgments of the unstylized scene and of the result; None without AlexNet, or if not rank 0."""
+    if not isinstance(novel_views.lpips, Lpips) or stylizer.job.collectives.rank:
+        return None
+    judge = make_judge(stylizer, novel_views, novel_views.lpips)
+    colors = {"before": stylizer.job.scene.sh_dc, "after": stylizer.stylized()}
+    judgments = {name: judge.judge(sh_dc) for name, sh_dc in colors.items()}
+    return {name: asdict(one) for name, one in judgments.items() if one} or None
 
 
 def make_novel_views(stylizer: Stylizer, *, lpips: PerceptualMetric | None = None, most: int = MAX_VIEWS) -> NovelViews:

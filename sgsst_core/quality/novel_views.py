@@ -209,8 +209,8 @@ DEPTH_TOLERANCE = 0.02
 _FOREIGN_FRACTION = 1e-3
 #: Fraction of comparable pixels below which a pair has no RMSE or LPIPS.
 MINIMUM_COMPARED = 0.01
-#: Number of pixels warped at a time. Each takes memory for about twenty values.
-_BAND_PIXELS = 1 << 20
+#: Number of pixels warped at a time. Each takes memory for about forty values.
+_BAND_PIXELS = 1 << 19
 #: Number of Gaussians whose depths are computed at a time.
 _GAUSSIANS = 1 << 18
 
@@ -400,21 +400,16 @@ def _around(
     The weight of an invalid pixel is 0: outside the view, of unknown depth, or at a depth that differs from z.
     """
     height, width = depth.depth.shape
+    right, below = torch.tensor([[0, 0, 1, 1], [0, 1, 0, 1]], device=x.device)[:, :, None]
     left, top = (x - 0.5).floor(), (y - 0.5).floor()
     across, down = ((x - 0.5) - left).float(), ((y - 0.5) - top).float()
-    nearest, farthest = z * (1 - tolerance), z * (1 + tolerance)
-    sources, weights = [], []
-    for right in (0, 1):
-        for below in (0, 1):
-            column, row = left.long() + right, top.long() + below
-            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            index = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
-            its_depth = depth.depth.view(-1)[index]
-            counts = inside & depth.known.view(-1)[index] & (its_depth >= nearest) & (its_depth <= farthest)
-            weight = (across if right else 1 - across) * (down if below else 1 - down)
-            sources.append(index.int())
-            weights.append(torch.where(counts, weight, 0.0))
-    return torch.stack(sources), torch.stack(weights)
+    columns, rows = left.long() + right, top.long() + below
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    index = rows.clamp(0, height - 1) * width + columns.clamp(0, width - 1)
+    its_depth = depth.depth.view(-1)[index]
+    agrees = (its_depth >= z * (1 - tolerance)) & (its_depth <= z * (1 + tolerance))
+    weights = torch.where(right > 0, across, 1 - across) * torch.where(below > 0, down, 1 - down)
+    return index.int(), torch.where(inside & depth.known.view(-1)[index] & agrees, weights, 0.0)
 
 
 def compare(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import io
-import math
 import random
 import secrets
 from collections.abc import Callable, Sequence
@@ -16,14 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
+import scipy  # imports its modules at first use
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from sgsst_core.errors import InvalidInputError, SettingsError
 from sgsst_core.files.atomic import atomic_path, write_json
+from sgsst_core.files.images import to_image
 from sgsst_core.scene.colors import resize_area
 from sgsst_core.settings import reason
 
@@ -32,8 +31,6 @@ VARIANTS = range(2, 5)
 #: Maximum longer side in pixels of the style image on the page.
 _STYLE_SIDE = 640
 _JPEG_QUALITY = 92
-#: Quantile of the normal distribution for intervals of 95 %.
-_NORMAL_95 = 1.959963984540054
 
 
 F = TypeVar("F", bound="_File")
@@ -179,23 +176,11 @@ def count_votes(key: Path, files: Sequence[Path]) -> list[VoteShare]:
     chosen = [variant_of[vote.view][vote.chosen] for votes in by_voter.values() for vote in votes.votes]
     if not chosen:
         raise StudyError("There are no votes in these files.")
-    shares = [
-        VoteShare(name, chosen.count(name), len(chosen), *wilson_interval(chosen.count(name), len(chosen)))
-        for name in known.variants
-    ]
+    shares = []
+    for name in known.variants:
+        interval = scipy.stats.binomtest(chosen.count(name), len(chosen)).proportion_ci(0.95, method="wilson")
+        shares.append(VoteShare(name, chosen.count(name), len(chosen), float(interval.low), float(interval.high)))
     return sorted(shares, key=lambda share: -share.votes)
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Return the 95 % score interval of a proportion (Wilson 1927), which holds for few trials and shares near 0 and 1.
-
-    Args:
-        successes: Number of successes, 0 to `trials`.
-    """
-    share, square = successes / trials, _NORMAL_95**2
-    center = (share + square / (2 * trials)) / (1 + square / trials)
-    half = _NORMAL_95 / (1 + square / trials) * math.sqrt(share * (1 - share) / trials + square / (4 * trials**2))
-    return max(0.0, center - half), min(1.0, center + half)
 
 
 def _read(kind: type[F], path: Path) -> F:
@@ -212,7 +197,6 @@ def _read(kind: type[F], path: Path) -> F:
 
 def _data_uri(image: Tensor) -> str:
     """Return an image [H, W, 3] in 0..1 as a data URI with a JPEG."""
-    levels = (image.clamp(0, 1) * 255).round().cpu().numpy().astype(np.uint8)
     buffer = io.BytesIO()
-    Image.fromarray(levels).save(buffer, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
+    to_image(image).save(buffer, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -37,12 +37,11 @@ from sgsst_core.loss.terms import (
     search,
     style_loss,
 )
-from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.regions import Region, Regions, check_regions
 from sgsst_core.scales import ScaleWeights, scale_count
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.settings import StyleLossName
-from sgsst_core.style import Style, chosen_positions
+from sgsst_core.style import STARRY_NIGHT, Style, chosen_positions
 from tests.networks import comparing_pixels
 from tests.networks import tiny_weights as make_tiny_weights
 from tests.sgsst_core.synthetic_images import nearly_one_color, relative_error, synthetic_image

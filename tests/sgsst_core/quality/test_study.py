@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 import torch
 from PIL import Image
-from scipy.stats import binomtest
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.quality.study import StudyError, count_votes, wilson_interval, write_study
+from sgsst_core.quality.study import StudyError, count_votes, write_study
 
 STYLE = torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0))
 
@@ -76,7 +75,7 @@ def test_fractions_of_votes_cover_all_voters(study: tuple[Path, Path], tmp_path:
     first, second = count_votes(key, files)
     assert (first.variant, first.votes, first.total) == ("our-method", 4, 5)
     assert (second.variant, second.votes) == ("their-method", 1)
-    assert first.low < 0.8 < first.high
+    assert (first.low, first.high) == pytest.approx((0.3755, 0.9638), abs=1e-4)  # of Wilson
 
 
 def test_votes_of_a_voter_count_once(study: tuple[Path, Path], tmp_path: Path) -> None:
@@ -126,9 +125,3 @@ def test_wrong_numbers_and_names_of_variants_are_refused(tmp_path: Path, names: 
     with pytest.raises(SettingsError):
         write_study(tmp_path / "study.html", tmp_path / "study.key.json", names, STYLE, 3, views)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("successes", "trials"), [(0, 1), (0, 30), (7, 10), (30, 30), (400, 1000)])
-def test_intervals_agree_with_scipy(successes: int, trials: int) -> None:
-    expected = binomtest(successes, trials).proportion_ci(method="wilson")
-    assert wilson_interval(successes, trials) == pytest.approx((expected.low, expected.high), abs=1e-12)
