@@ -29,6 +29,7 @@ from statistics import fmean
 from typing import Any
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 
 from benchmarks.common import RESULTS, add_pair, is_of_this_code, parse, read_views
@@ -37,7 +38,8 @@ from benchmarks.equal_steps import UNSTYLIZED, judged
 from sgsst_core import Stylizer, load_image, make_settings
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.features.network_weights import load_network_weights
-from sgsst_core.quality.judge import Judge, Lpips, VggLpips, shown
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.quality.judge import Judge, Lpips, shown
 from sgsst_core.quality.novel_views import (
     LONG_RANGE,
     SHORT_RANGE,
@@ -179,6 +181,31 @@ def path_cameras(data: Path, name: str, scene: Scene, own: list[Camera], resolut
         source = CIRCLE if source.startswith("orbit:") else str(data / "scenes" / source)
         own = read_views(source, scene, sys.maxsize, resolution)
     return [between(*pair) for pair in neighbors(own)]
+
+
+#: Layers of VGG16 that LPIPS compares, and the file of their weights.
+_VGG_LAYERS = ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3")
+_VGG_HEADS = Path(__file__).with_name("lpips") / "vgg.safetensors"
+
+
+class VggLpips(Lpips):
+    """LPIPS with VGG16, as papers report consistency.
+
+    Features are in other units than torchvision's, which makes no difference, since they are scaled to unit length.
+    """
+
+    network = "vgg"
+
+    def __init__(self, dtype: torch.dtype = torch.float32) -> None:
+        self.dtype, self.device = dtype, torch.device("cpu")
+        heads = load_file(_VGG_HEADS)
+        self._heads = [heads[f"linear{layer}.weight"].to(dtype) for layer in range(1, 6)]
+        self._vgg = FeatureNetwork(load_network_weights("vgg16"), _VGG_LAYERS, dtype)
+
+    def features(self, image: Tensor) -> list[Tensor]:
+        """Return the features [h, w, c] of the five layers for an image [H, W, 3] with values 0 to 1."""
+        features = self._vgg.forward(image, cache=False).features
+        return [features[layer] for layer in _VGG_LAYERS]
 
 
 class ViewPath:

@@ -116,7 +116,7 @@ def test_wheel_contains_the_licenses_of_its_files(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         packed = {name.partition(".dist-info/licenses/")[2] for name in archive.namelist()}
     vendored = {f"api/static/vendor/{name}" for name in ("fzstd/LICENSE", "swagger-ui/LICENSE", "swagger-ui/NOTICE")}
-    assert {"LICENSE", "docs/credits.md", "sgsst_core/quality/lpips/LICENSE"} | vendored <= packed
+    assert {"LICENSE", "docs/credits.md"} | vendored <= packed
 
 
 def test_web_page_and_its_assets_are_installed(installed: Path, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.plan import LOSS_VIEWS
-from sgsst_core.quality.judge import MIN_SIDE, Judge, Judgment, VggLpips, load_lpips_or_none, load_vgg_lpips_or_none
+from sgsst_core.quality.judge import MIN_SIDE, Judge, Judgment, Lpips, load_lpips_or_none
 from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
 from sgsst_core.quality.novel_views import Consistency, NovelViewMoment
 from sgsst_core.report.images import INK, color_of, write_grid
@@ -394,7 +394,7 @@ class Quality:
         """Return the comparison as JSON-serializable values."""
         return {
             "views": [camera.name for camera in self.judge.cameras],
-            "lpips": VggLpips.network,
+            "lpips": Lpips.network,
             "outcomes": [outcome.as_dict() for outcome in self.outcomes],
             "front": [outcome.name for outcome in self.front()],
             "error_time": as_dict(self.curves),
@@ -424,7 +424,7 @@ def compare_quality(
     if lpips is None:
         raise WeightsError("results are judged by AlexNet, which is not installed: run `sgsst weights fetch vgg16`.")
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings), weights=weights)
-    novel_views = make_novel_views(stylizer, lpips=load_vgg_lpips_or_none())
+    novel_views = make_novel_views(stylizer, lpips=lpips)
     judge = make_judge(stylizer, novel_views, lpips)
     if not judge.cameras:
         raise SettingsError(

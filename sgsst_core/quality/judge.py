@@ -19,24 +19,19 @@ Simoncelli, "Image Quality Assessment: From Error Visibility to Structural Simil
 from __future__ import annotations
 
 import operator
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 from statistics import fmean
-from typing import ClassVar
 
 import scipy  # imports its modules at first use
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
-from sgsst_core.features.network_weights import list_network_weights, load_network_weights, load_perceptual
-from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.features.weight_files import PACKAGE_SOURCE
+from sgsst_core.features.network_weights import list_network_weights, load_perceptual
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.colors import luminance, resize_area, style_size
@@ -382,28 +377,32 @@ MIN_SIDE = 31
 _LENGTH_EPS = 1e-10
 
 
-class PerceptualMetric(ABC):
-    """LPIPS with one of the networks that its authors calibrated.
+class Lpips:
+    """LPIPS with AlexNet, which the authors recommend as a metric.
 
     Args:
-        heads: Weights [c] of the channels of each of the five layers.
+        dtype: torch.float32, or torch.float64 for the reference.
+        folder: Folder of the weights; None for the cache folder.
 
     Attributes:
-        network: Name of the network in reports: "alex" or "vgg".
+        network: Name of the network in reports.
+
+    Raises:
+        WeightsError: If the weights are missing or corrupt.
     """
 
-    network: ClassVar[str]
+    network = "alex"
 
-    def __init__(self, heads: list[Tensor]) -> None:
-        self._heads = heads
-        self.dtype, self.device = heads[0].dtype, heads[0].device
-
-    @abstractmethod
-    def features(self, image: Tensor) -> list[Tensor]:
-        """Return the features [h, w, c] of the five layers for an image [H, W, 3] with values 0 to 1.
-
-        The sides of the image must be at least `MIN_SIDE`.
-        """
+    def __init__(
+        self,
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+        folder: Path | None = None,
+    ) -> None:
+        self.dtype, self.device = dtype, torch.device(device)
+        self._tensors = {name: tensor.to(device, dtype) for name, tensor in load_perceptual(folder).items()}
+        self._heads = [self._tensors[f"linear{layer}.weight"] for layer in range(1, 6)]
 
     @torch.no_grad()
     def distance(self, first: Tensor, second: Tensor) -> Tensor:
@@ -426,33 +425,12 @@ class PerceptualMetric(ABC):
             spatial += F.interpolate(distances, size=size, mode="bilinear", align_corners=False)[0, 0]
         return spatial
 
-
-class Lpips(PerceptualMetric):
-    """LPIPS with AlexNet, which the authors recommend as a metric.
-
-    Args:
-        dtype: torch.float32, or torch.float64 for the reference.
-        folder: Folder of the weights; None for the cache folder.
-
-    Raises:
-        WeightsError: If the weights are missing or corrupt.
-    """
-
-    network = "alex"
-
-    def __init__(
-        self,
-        *,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str = "cpu",
-        folder: Path | None = None,
-    ) -> None:
-        self._tensors = {name: tensor.to(device, dtype) for name, tensor in load_perceptual(folder).items()}
-        super().__init__([self._tensors[f"linear{layer}.weight"] for layer in range(1, 6)])
-
     @torch.no_grad()
     def features(self, image: Tensor) -> list[Tensor]:
-        """Return the features of the five layers; see `PerceptualMetric.features`."""
+        """Return the features [h, w, c] of the five layers for an image [H, W, 3] with values 0 to 1.
+
+        The sides of the image must be at least `MIN_SIDE`.
+        """
         tensors, outputs = self._tensors, []
         rgb = image.to(self.device, self.dtype)
         x = (rgb * tensors["input_scale"] + tensors["input_shift"]).permute(2, 0, 1).unsqueeze(0)
@@ -482,36 +460,6 @@ class Lpips(PerceptualMetric):
         return minima
 
 
-#: Layers of VGG16 that LPIPS compares, and the file of their weights.
-_VGG_LAYERS = ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3")
-_VGG_HEADS = Path(__file__).with_name("lpips") / "vgg.safetensors"
-
-
-class VggLpips(PerceptualMetric):
-    """LPIPS with VGG16; arguments and errors are those of `Lpips`.
-
-    Features are in other units than torchvision's, which makes no difference, since they are scaled to unit length.
-    """
-
-    network = "vgg"
-
-    def __init__(
-        self,
-        *,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str = "cpu",
-        folder: Path | None = None,
-    ) -> None:
-        heads = load_file(_VGG_HEADS)
-        super().__init__([heads[f"linear{layer}.weight"].to(device, dtype) for layer in range(1, 6)])
-        self._vgg = FeatureNetwork(load_network_weights("vgg16", folder), _VGG_LAYERS, dtype, device)
-
-    def features(self, image: Tensor) -> list[Tensor]:
-        """Return the features of the five layers; see `PerceptualMetric.features`."""
-        features = self._vgg.forward(image.to(self.device), cache=False).features
-        return [features[layer] for layer in _VGG_LAYERS]
-
-
 def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> Lpips | None:
     """Load LPIPS with AlexNet in float32, or return None if its weights (installed along with VGG16's) are missing.
 
@@ -520,18 +468,6 @@ def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None =
     """
     installed = any(entry.name == "lpips_alex" and entry.path for entry in list_network_weights(folder))
     return Lpips(device=device, folder=folder) if installed else None
-
-
-def load_vgg_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> VggLpips | None:
-    """Load LPIPS with VGG16 in float32, or return None if VGG16 is missing or not the downloaded one.
-
-    The heads of LPIPS are not calibrated for another VGG16, such as Caffe's or a pruned one.
-
-    Raises:
-        WeightsError: If the weights are installed but corrupt.
-    """
-    entries = [entry for entry in list_network_weights(folder) if entry.name == "vgg16" and entry.path]
-    return VggLpips(device=device, folder=folder) if any(entry.source == PACKAGE_SOURCE for entry in entries) else None
 
 
 def _unit_features(features: Tensor) -> Tensor:

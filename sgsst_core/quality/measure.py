@@ -25,7 +25,7 @@ from sgsst_core.files.scene_file import losses, read_scene
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.planning.survey import psnr
-from sgsst_core.quality.judge import Judge, Lpips, PerceptualMetric, load_lpips_or_none
+from sgsst_core.quality.judge import Judge, Lpips, load_lpips_or_none
 from sgsst_core.quality.novel_views import MAX_VIEWS, NovelViews
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
@@ -91,7 +91,7 @@ class Measurements:
 
 def _judged(stylizer: Stylizer, novel_views: NovelViews) -> dict[str, Any] | None:
     """Return the judgments of the unstylized scene and of the result; None without AlexNet, or if not rank 0."""
-    if not isinstance(novel_views.lpips, Lpips) or stylizer.job.collectives.rank:
+    if novel_views.lpips is None or stylizer.job.collectives.rank:
         return None
     judge = make_judge(stylizer, novel_views, novel_views.lpips)
     colors = {"before": stylizer.job.scene.sh_dc, "after": stylizer.stylized()}
@@ -99,7 +99,7 @@ def _judged(stylizer: Stylizer, novel_views: NovelViews) -> dict[str, Any] | Non
     return {name: asdict(one) for name, one in judgments.items() if one} or None
 
 
-def make_novel_views(stylizer: Stylizer, *, lpips: PerceptualMetric | None = None, most: int = MAX_VIEWS) -> NovelViews:
+def make_novel_views(stylizer: Stylizer, *, lpips: Lpips | None = None, most: int = MAX_VIEWS) -> NovelViews:
     """Create the novel views of a job; their Gram distance is that of the paper's loss in float32 for every job."""
     job, source = stylizer.job, ExactLoss(stylizer, "sos")
     scene = job.scene.without_zero_bands()

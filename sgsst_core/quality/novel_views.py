@@ -25,7 +25,7 @@ from sgsst_core.budget import Cache, tensor_bytes
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import StyleTargets
 from sgsst_core.planning.survey import sees_something
-from sgsst_core.quality.judge import MIN_SIDE, PerceptualMetric, shown
+from sgsst_core.quality.judge import MIN_SIDE, Lpips, shown
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions import RegionMaps
 from sgsst_core.scene.camera import Camera, between, moved, nearest_walk, similarly_rotated, spread
@@ -100,7 +100,7 @@ class NovelViews:
         style_targets: Callable[[Camera], StyleTargets],
         *,
         weighted: bool,
-        lpips: PerceptualMetric | None = None,
+        lpips: Lpips | None = None,
         most: int = MAX_VIEWS,
         memory: int = 1 << 29,
         maps: RegionMaps | None = None,
@@ -252,7 +252,7 @@ def consistency(
     pairs: Sequence[tuple[int, int]],
     image: Callable[[int], Tensor],
     warp: Callable[[int, int], Warp],
-    lpips: PerceptualMetric | None = None,
+    lpips: Lpips | None = None,
 ) -> Consistency:
     """Compute the consistency of at least one pair of views `gap` apart.
 
@@ -413,7 +413,7 @@ def _around(
 
 
 def compare(
-    image: Tensor, warped: Tensor, valid: Tensor, lpips: PerceptualMetric | None
+    image: Tensor, warped: Tensor, valid: Tensor, lpips: Lpips | None
 ) -> tuple[float, float | None, float | None]:
     """Compare a view's image [H, W, 3] with another view's warped image, where the mask `valid` [H, W] is true.
 

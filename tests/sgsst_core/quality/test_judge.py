@@ -11,6 +11,7 @@ from skimage import data
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
+from benchmarks.methods import VggLpips
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import load_perceptual
@@ -20,9 +21,7 @@ from sgsst_core.quality.judge import (
     Judge,
     Judgment,
     Lpips,
-    VggLpips,
     load_lpips_or_none,
-    load_vgg_lpips_or_none,
     saturated,
     ssim,
 )
@@ -245,7 +244,7 @@ def test_ssim_agrees_with_scikit_image() -> None:
 
 
 @pytest.fixture(scope="module", params=[Lpips, VggLpips], ids=["alex", "vgg"])
-def exact(request: pytest.FixtureRequest, vgg16_weights: object) -> Lpips | VggLpips:
+def exact(request: pytest.FixtureRequest, vgg16_weights: object) -> Lpips:
     """Load LPIPS in float64, with AlexNet and with VGG16."""
     return request.param(dtype=torch.float64)
 
@@ -274,7 +273,7 @@ def test_zero_for_equal_images_and_symmetric(vgg16_weights, network, dtype):
     assert torch.equal(forth, back)
 
 
-def test_float32_agrees_with_float64(exact: Lpips | VggLpips):
+def test_float32_agrees_with_float64(exact: Lpips):
     first, second = synthetic_image(45, 61, seed=3), synthetic_image(45, 61, seed=4)
     reference, result = exact.distance(first, second), type(exact)().distance(first, second)
     assert result.dtype == torch.float32
@@ -292,7 +291,7 @@ PUBLISHED = [
 
 
 @pytest.mark.parametrize(("name", "changed", "expected"), PUBLISHED, ids=["curve", "blur"] * 2)
-def test_agrees_with_the_published_code(exact: Lpips | VggLpips, name, changed, expected):
+def test_agrees_with_the_published_code(exact: Lpips, name, changed, expected):
     image, value = photo(name)[100:220, 150:300], expected[exact.network]
     result = exact.distance(image, changed(image))
     assert float(result.mean()) == pytest.approx(value, rel=2e-3)  # upsampling weighs the border differently
@@ -345,20 +344,20 @@ def upsampled(values: Array, size: tuple[int, ...]) -> Array:
     return matrix(values.shape[0], size[0]) @ values @ matrix(values.shape[1], size[1]).T
 
 
-def test_constant_images_are_finite(exact: Lpips | VggLpips):
+def test_constant_images_are_finite(exact: Lpips):
     black, white = torch.zeros(40, 40, 3), torch.ones(40, 40, 3)
     for first, second in ((black, white), (black, black), (white, 0.5 * white)):
         assert exact.distance(first, second).isfinite().all()
 
 
-def test_smallest_images_are_compared(exact: Lpips | VggLpips):
+def test_smallest_images_are_compared(exact: Lpips):
     first, second = synthetic_image(MIN_SIDE, 64, seed=7), synthetic_image(MIN_SIDE, 64, seed=8)
     assert float(exact.distance(first, second).mean()) > 0
 
 
-def test_missing_weights_are_named(exact: Lpips | VggLpips, tmp_path):
+def test_missing_weights_are_named(tmp_path):
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
-        type(exact)(folder=tmp_path)
+        Lpips(folder=tmp_path)
 
 
 def test_lpips_is_skipped_without_installed_weights(vgg16_weights, tmp_path):
@@ -367,9 +366,3 @@ def test_lpips_is_skipped_without_installed_weights(vgg16_weights, tmp_path):
     (tmp_path / "lpips_alex.safetensors").write_bytes(b"no weights")
     with pytest.raises(WeightsError, match="damaged"):
         load_lpips_or_none(folder=tmp_path)
-
-
-def test_vgg_lpips_needs_the_network_that_its_heads_were_calibrated_for(vgg16_weights, tiny_cache, tmp_path):
-    assert load_vgg_lpips_or_none() is not None
-    assert load_vgg_lpips_or_none(folder=tmp_path) is None
-    assert load_vgg_lpips_or_none(folder=tiny_cache) is None

@@ -15,7 +15,7 @@ from sgsst_core.constants import COARSEST_SHORTER_SIDE, COLOR_OFFSET, SH_C0
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import GRAM_WEIGHT
-from sgsst_core.quality.judge import Lpips, PerceptualMetric, VggLpips, shown
+from sgsst_core.quality.judge import Lpips, shown
 from sgsst_core.quality.novel_views import (
     Consistency,
     DepthMap,
@@ -149,9 +149,9 @@ def network(tiny_weights) -> FeatureNetwork:
     return FeatureNetwork(tiny_weights)
 
 
-@pytest.fixture(scope="module", params=[Lpips, VggLpips])
-def lpips(request, vgg16_weights) -> PerceptualMetric:
-    return request.param()
+@pytest.fixture(scope="module")
+def lpips(vgg16_weights) -> Lpips:
+    return Lpips()
 
 
 #: Shorter side of the coarsest scale in tests that need two scales of their small views.
@@ -329,7 +329,7 @@ def consistency_of(
     rasterizer: Rasterizer,
     scene: Scene,
     gap: int,
-    lpips: PerceptualMetric | None = None,
+    lpips: Lpips | None = None,
     at_most: int | None = None,
 ) -> Consistency:
     """Return the consistency of a scene's images over all pairs of views, or evenly spread ones."""
@@ -346,7 +346,7 @@ def consistency_of(
     )
 
 
-def measure(scene: Scene, cameras: list[Camera], gap: int = 1, lpips: PerceptualMetric | None = None) -> Consistency:
+def measure(scene: Scene, cameras: list[Camera], gap: int = 1, lpips: Lpips | None = None) -> Consistency:
     rasterizer = make_rasterizer("cpu", scene)
     return consistency_of(renders(scene, cameras, rasterizer), cameras, rasterizer, scene, gap, lpips)
 
