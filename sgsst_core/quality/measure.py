@@ -101,7 +101,7 @@ def _judged(stylizer: Stylizer, novel_views: NovelViews) -> dict[str, Any] | Non
 
 def make_novel_views(stylizer: Stylizer, *, lpips: Lpips | None = None, most: int = MAX_VIEWS) -> NovelViews:
     """Create the novel views of a job; their Gram distance is that of the paper's loss in float32 for every job."""
-    job, source = stylizer.job, ExactLoss(stylizer, "sos")
+    job, source = stylizer.job, Float32Reference(stylizer, style_loss="sos")
     scene = job.scene.without_zero_bands()
     own = job.views.rasterizer.uncached  # caches the latest tile intersections only
     rasterizer = own.for_scene(scene, **own.options(0))
@@ -180,32 +180,23 @@ class GradientError(Difference):
     seconds_exact: float
 
 
-class ExactLoss:
-    """Loss of a job in float32.
+class Float32Reference:
+    """Exact loss and gradient of a job's colors in float32.
 
     Args:
         stylizer: Job to evaluate; not modified.
+        memory: Budget in bytes for view targets.
         style_loss: Style loss to evaluate, for comparing jobs with different style losses; None for the job's own.
     """
 
-    def __init__(self, stylizer: Stylizer, style_loss: StyleLossName | None = None) -> None:
+    def __init__(self, stylizer: Stylizer, memory: int = 1 << 30, *, style_loss: StyleLossName | None = None) -> None:
         self._stylizer = stylizer
-        settings = stylizer.job.settings
+        settings, weights, own = stylizer.job.settings, stylizer.job.weights, stylizer.job.loss
         settings = settings.model_copy(update={"style_loss": style_loss or settings.style_loss})
-        with_content, weights = settings.content_weight > 0, stylizer.job.weights
-        layers = layers_of(settings.style_loss, weights, content=with_content)
+        layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0)
         network = FeatureNetwork(weights, layers, torch.float32, stylizer.job.network.device)
-        own = stylizer.job.loss
         self.loss = make_loss(network, settings, own.memory, content_weight=own.content_weight)
         self.style_targets = stylizer.job.styles.cached_targets(self.loss)
-
-
-class Float32Reference(ExactLoss):
-    """Exact loss and gradient of a job's colors; `memory` is the budget in bytes for view targets."""
-
-    def __init__(self, stylizer: Stylizer, memory: int = 1 << 30, *, style_loss: StyleLossName | None = None) -> None:
-        super().__init__(stylizer, style_loss)
-        settings = stylizer.job.settings
         rasterizer = stylizer.job.views.rasterizer.uncached
         self.seen = stylizer.job.plan.seen
         self.views = Views(

@@ -282,12 +282,15 @@ def loss_over_time(stylizer: Stylizer, before: Evaluation, stopped: Stopped) -> 
         return None
     length = stylizer.job.round_length
     relative = [smoothed(losses[max(0, end - length) : end], length) / start for end in range(1, len(losses) + 1)]
-    reached = []
-    for wanted in _REACHED:
-        first = next((i for i, value in enumerate(relative) if value <= wanted), None)
-        if first is not None:
-            entry = {"relative": wanted, "seconds": round(records[first].seconds, 3), "step": records[first].step}
-            reached.append(entry)
+    firsts = {
+        wanted: next((record for record, value in zip(records, relative, strict=True) if value <= wanted), None)
+        for wanted in _REACHED
+    }
+    reached = [
+        {"relative": wanted, "seconds": round(record.seconds, 3), "step": record.step}
+        for wanted, record in firsts.items()
+        if record
+    ]
     border = 0.9 * stylizer.seconds
     earlier = [value for record, value in zip(records, relative, strict=True) if record.seconds <= border]
     last = {"seconds": stylizer.seconds - border, "from": earlier[-1], "to": relative[-1]} if earlier else None

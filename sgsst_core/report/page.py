@@ -94,12 +94,10 @@ def _base64(content: bytes) -> str:
 
 
 def _style_names(report: dict[str, Any]) -> str:
-    """Return the file names of the style images."""
-    styles = report["styles"]
-    names = [PurePath(style["path"]).name for style in styles]
-    if len(names) == 1:
-        return names[0]
-    return ", ".join(f"{name} ({style['weight']:.0%})" for name, style in zip(names, styles, strict=True))
+    """Return the file names of the style images, with their weights if there are several."""
+    names = [PurePath(style["path"]).name for style in report["styles"]]
+    weights = [f" ({style['weight']:.0%})" if len(names) > 1 else "" for style in report["styles"]]
+    return ", ".join(map("".join, zip(names, weights, strict=True)))
 
 
 def write_page(path: Path, report: dict[str, Any], sheet_path: Path | None, views_path: Path | None = None) -> None:
