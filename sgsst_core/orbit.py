@@ -414,11 +414,9 @@ ELEVATION = 10.0
 _FOCAL = 1.5
 #: Margin around the subject, as a factor of its extent in the frame.
 _MARGIN = 1.03
-#: Aspect ratios (width over height) are powers of `_STEP`, a quarter octave, so that an orbit has few different sizes.
-#: They are at most `_MAX_STEPS` steps from square, which is 4 to 1.
+#: Aspect ratios (width over height) are powers of `_STEP`, a quarter octave. They are at most `_MAX_STEPS` steps from
+#: square, which is 4 to 1.
 _STEP, _MAX_STEPS = 2**0.25, 8
-#: Minimum area of a frame as a fraction of the largest, so that stroke sizes stay within half an octave.
-_SMALLEST = 0.5
 #: Minimum distance of the subject's nearest point, as a multiple of the near plane.
 _NEAR_MARGIN = 1.1
 #: Tangent of the maximum half field of view, for cameras that an explicit radius places inside the subject.
@@ -436,10 +434,11 @@ def orbit(
     height: int | None = None,
     near: float = 0.2,
 ) -> list[Camera]:
-    """Return cameras on rings around the subject of a scene, all at the same distance, each framed to fit the subject.
+    """Return cameras on rings around the subject of a scene, all at the same distance and with the same frame.
 
-    Stray Gaussians and background are ignored (`find_subject`). The cameras look at the center of the visible part of
-    the subject. Aspect ratios follow its shape, and every frame has as many pixels as 1024x768.
+    Stray Gaussians and background are ignored (`find_subject`). The cameras look at the center of the subject. The
+    frame fits it from every camera; its aspect ratio follows the subject's shape, and it has as many pixels as
+    1024x768.
 
     Args:
         count: Number of cameras, distributed over the rings so that neighbors are about equally far apart.
@@ -447,8 +446,8 @@ def orbit(
         elevations: Elevation of each ring above the scene's horizon in degrees, between -90 and 90.
         radius: Distance of the cameras from the center in world units; None for the smallest distance at which the
             subject fits in a field of view of 37 degrees from every camera.
-        width: Width in pixels of every frame; None to follow the shape of the subject.
-        height: Height in pixels of every frame; None to follow the shape of the subject.
+        width: Width of the frame in pixels; None to follow the shape of the subject.
+        height: Height of the frame in pixels; None to follow the shape of the subject.
         near: Near plane of the rasterizer in world units; cameras stay at least that far from the subject.
 
     Raises:
@@ -462,26 +461,15 @@ def orbit(
     """
     axis = _checked(count, up, elevations, radius, (width, height))
     subject = scene if isinstance(scene, Subject) else find_subject(scene)
-    directions, middle = ring_directions(count, axis, elevations), middle_of(subject, axis)
-    if radius is None:
-        radius = _distance(subject.hull - middle, directions, axis, near)
-    frames = []
-    for direction in directions:
-        target, half = _frame(subject, middle, radius * direction, axis, near)
-        shape = width / height if width and height else _shape(half)
-        frames.append((middle + radius * direction, target, shape, _widened(half, shape)))
-    least = _SMALLEST * max(x * y for *_, (x, y) in frames)
-    cameras = []
-    for i, (position, target, shape, (x, y)) in enumerate(frames):
-        wider = math.sqrt(max(1.0, least / (x * y)))
-        pixels = _PIXELS * RESOLUTION**2
-        columns, rows = width or round(math.sqrt(pixels * shape)), height or round(math.sqrt(pixels / shape))
-        focal = min(columns / (2 * x * wider), rows / (2 * y * wider))
-        side = None if width else RESOLUTION
-        cameras.append(
-            look_at(f"orbit_{i:04d}", position, target, axis, width=columns, height=rows, focal=focal, resolution=side)
-        )
-    return cameras
+    directions = ring_directions(count, axis, elevations)
+    positions, middle, (x, y) = _standpoints(subject, directions, axis, radius, near)
+    pixels, shape = _PIXELS * RESOLUTION**2, _shape(x, y)
+    columns, rows = width or round(math.sqrt(pixels * shape)), height or round(math.sqrt(pixels / shape))
+    focal, side = min(columns / (2 * x), rows / (2 * y)), None if width else RESOLUTION
+    return [
+        look_at(f"orbit_{i:04d}", position, middle, axis, width=columns, height=rows, focal=focal, resolution=side)
+        for i, position in enumerate(positions)
+    ]
 
 
 def turntable(
@@ -494,9 +482,7 @@ def turntable(
     side: int = RESOLUTION,
     near: float = 0.2,
 ) -> list[Camera]:
-    """Return the cameras of a video once around a subject: a ring of one frame size, focal length and target.
-
-    The frame fits the subject from every camera, in the aspect ratio of `orbit`.
+    """Return the cameras of a video once around a subject: a ring with the frame of `orbit`, in another size.
 
     Args:
         count: Number of cameras, all different: the video continues with the first one.
@@ -508,18 +494,13 @@ def turntable(
         SettingsError: If a value is out of range; see `orbit`.
     """
     axis = _checked(count, up, (elevation,), radius, (side, side))
-    directions, middle = ring_directions(count, axis, (elevation,)), middle_of(subject, axis)
-    if radius is None:
-        radius = _distance(subject.hull - middle, directions, axis, near)
-    halves = [_half_extents(subject, middle + radius * direction, middle, axis, near) for direction in directions]
-    half = (max(x for x, _ in halves), max(y for _, y in halves))
-    shape = _shape(half)
-    x, y = _widened(half, shape)
-    width, height = (max(1, round(side * min(1.0, ratio))) for ratio in (shape, 1 / shape))
+    directions = ring_directions(count, axis, (elevation,))
+    positions, middle, (x, y) = _standpoints(subject, directions, axis, radius, near)
+    width, height = (max(1, round(side * min(1.0, ratio))) for ratio in (_shape(x, y), 1 / _shape(x, y)))
     focal = min(width / (2 * x), height / (2 * y))
     return [
-        look_at(f"turn_{index:05d}", middle + radius * direction, middle, axis, width=width, height=height, focal=focal)
-        for index, direction in enumerate(directions)
+        look_at(f"turn_{index:05d}", position, middle, axis, width=width, height=height, focal=focal)
+        for index, position in enumerate(positions)
     ]
 
 
@@ -592,63 +573,46 @@ def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: f
     return distance
 
 
-def _frame(
-    subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: float
-) -> tuple[Tensor, tuple[float, float]]:
-    """Return the target [3] in the middle of what a camera at an offset from the center sees of the subject.
+def _standpoints(
+    subject: Subject, directions: Sequence[Tensor], up: Tensor, radius: float | None, near: float
+) -> tuple[list[Tensor], Tensor, tuple[float, float]]:
+    """Place cameras around a subject.
+
+    Args:
+        directions: Unit vectors [3] from the center to the cameras.
+        radius: Distance of the cameras from the center; None for the smallest one that suits all.
 
     Returns:
-        The target, and half the width and height at depth 1 that the camera must show.
+        Positions [3] of the cameras, the center [3], and half the width and height at depth 1 that show the subject
+            from all of them.
     """
-    position, target = middle + offset, middle
-    half = (0.0, 0.0)
-    for _ in range(5):
-        rotation, slopes = _slopes(subject, position, target, up, near)
-        if not len(slopes):
-            break
-        half = (float(slopes[:, 0].abs().amax()), float(slopes[:, 1].abs().amax()))
-        aim = torch.cat([(slopes.amin(0) + slopes.amax(0)) / 2, torch.ones(1, dtype=torch.float64)])
-        if float(aim[:2].abs().amax()) < 1e-3 * max(half):
-            break
-        target = position + float(offset.norm()) * (rotation.T @ aim)
-    return target, _with_margin(half, subject, float(offset.norm()))
+    middle = middle_of(subject, up)
+    if radius is None:
+        radius = _distance(subject.hull - middle, directions, up, near)
+    positions = [middle + radius * direction for direction in directions]
+    halves = torch.stack([_half_extents(subject, position, middle, up, near) for position in positions])
+    x, y = halves.amax(0).tolist()
+    return positions, middle, (x, y)
 
 
-def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> tuple[float, float]:
-    """Return half the width and height at depth 1 that show a subject from a position toward a target."""
-    slopes = _slopes(subject, position, target, up, near)[1]
-    half = slopes.abs().amax(0).tolist() if len(slopes) else (0.0, 0.0)
-    return _with_margin(half, subject, float((target - position).norm()))
-
-
-def _slopes(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> tuple[Tensor, Tensor]:
-    """Return a camera's rotation [3, 3], and the x and y [n, 2] of the visible subject at depth 1."""
-    pose = look_at("", position, target, up, width=1, height=1, focal=1.0).world_to_camera
-    local = subject.hull @ pose[:3, :3].T + pose[:3, 3]
-    visible = local[local[:, 2] > near]
-    return pose[:3, :3], (visible[:, :2] / visible[:, 2:]).clamp(-_WIDEST, _WIDEST)
-
-
-def _with_margin(half: Sequence[float], subject: Subject, distance: float) -> tuple[float, float]:
-    """Return half extents with a margin around the subject.
+def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> Tensor:
+    """Return half the width and height [2] at depth 1 that show a subject from a position, with a margin.
 
     A single point has no extent, so it gets a small one. With that of the pixel blur, it would look the same from any
     distance.
     """
-    least = 1e-3 * subject.size / distance + 1e-6
-    return _MARGIN * max(half[0], least), _MARGIN * max(half[1], least)
+    pose = look_at("", position, target, up, width=1, height=1, focal=1.0).world_to_camera
+    local = subject.hull @ pose[:3, :3].T + pose[:3, 3]
+    visible = local[local[:, 2] > near]
+    slopes = (visible[:, :2] / visible[:, 2:]).abs().clamp_max(_WIDEST)
+    least = slopes.new_full((1, 2), 1e-3 * subject.size / float((target - position).norm()) + 1e-6)
+    return _MARGIN * torch.cat([slopes, least]).amax(0)
 
 
-def _shape(half: tuple[float, float]) -> float:
+def _shape(x: float, y: float) -> float:
     """Return the permitted aspect ratio (width over height) that is nearest to that of the half extents."""
-    steps = round(math.log(half[0] / half[1]) / math.log(_STEP))
+    steps = round(math.log(x / y) / math.log(_STEP))
     return float(_STEP ** max(-_MAX_STEPS, min(_MAX_STEPS, steps)))
-
-
-def _widened(half: tuple[float, float], shape: float) -> tuple[float, float]:
-    """Return the half extents of the smallest frame of an aspect ratio that contains these half extents."""
-    x, y = half
-    return (max(x, y * shape), max(y, x / shape))
 
 
 #: Elevations in degrees of an orbit's rings, the most important first. Rings below the horizon are only for an isolated

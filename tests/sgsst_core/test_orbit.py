@@ -267,6 +267,8 @@ def test_every_frame_contains_the_object_and_is_filled_by_it(
     axis = torch.tensor(up, dtype=torch.float64) / torch.tensor(up, dtype=torch.float64).norm()
     distances = torch.stack([(view.center - middle).norm() for view in views])
     assert torch.allclose(distances, distances[0].expand(7), rtol=0.02)
+    assert len({(view.width, view.height, view.fx) for view in views}) == 1
+    filled = []
     for view in views:
         assert view.fx == view.fy
         assert bool(in_view(view, means).all())
@@ -274,32 +276,32 @@ def test_every_frame_contains_the_object_and_is_filled_by_it(
         places, _ = project(view, torch.stack([middle, middle + 0.1 * size * axis]))
         assert float(places[1, 1]) < float(places[0, 1])  # up in the world is up in the image
         places, _ = project(view, means)
+        filled.append(float((places.amax(0) - places.amin(0)).amax()))
         if shape is None:
             assert view.width * view.height == pytest.approx(PIXELS, rel=2e-3)
-            assert float((places.amax(0) - places.amin(0)).amin()) > 0.65
         else:
             assert (view.width, view.height) == shape
-        assert float((places.amax(0) - places.amin(0)).amax()) > 0.55
-        assert torch.allclose(places.amax(0) + places.amin(0), torch.ones(2, dtype=torch.float64), atol=0.03)
+        assert torch.allclose(project(view, middle[None])[0], torch.full((1, 2), 0.5).double(), atol=0.03)
+    assert max(filled) > 0.7
 
 
-def test_frames_have_few_aspect_ratios_that_follow_the_object() -> None:
+def test_aspect_ratio_follows_the_object() -> None:
     standing = orbit(figure(), 12)
     assert all(view.height > 2 * view.width for view in standing)
-    assert len({view.width for view in standing}) <= 4
     lying = orbit(scene_of(box((-2, -0.2, -2), (2, 0.2, 2), 3000)), 12, elevations=[0.0])
     assert all(view.width > 2 * view.height for view in lying)
 
 
 def test_frames_have_a_margin_around_the_object() -> None:
-    """In a render, the object is not cropped, and fills most of its box's area."""
-    scene = figure()
+    """In a render, the object is not cropped, and fills much of the frame from its broad side."""
+    scene, means = figure(), []
     rasterizer = make_rasterizer("cpu", scene)
     for view in orbit(scene, 5, elevations=[10.0, 45.0]):
         coverage = rasterizer.coverage(resized(view, 256))
         border = torch.cat([coverage[0], coverage[-1], coverage[:, 0], coverage[:, -1]])
         assert float(border.amax()) < 0.1
-        assert float(coverage.mean()) > 0.35
+        means.append(float(coverage.mean()))
+    assert max(means) > 0.3
 
 
 def test_cameras_are_distributed_over_rings_by_circumference() -> None:
