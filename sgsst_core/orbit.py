@@ -462,45 +462,18 @@ def orbit(
     axis = _checked(count, up, elevations, radius, (width, height))
     subject = scene if isinstance(scene, Subject) else find_subject(scene)
     directions = ring_directions(count, axis, elevations)
-    positions, middle, (x, y) = _standpoints(subject, directions, axis, radius, near)
+    middle = middle_of(subject, axis)
+    if radius is None:
+        radius = _distance(subject.hull - middle, directions, axis, near)
+    positions = [middle + radius * direction for direction in directions]
+    halves = torch.stack([_half_extents(subject, position, middle, axis, near) for position in positions])
+    x, y = halves.amax(0).tolist()
     pixels, shape = _PIXELS * RESOLUTION**2, _shape(x, y)
     columns, rows = width or round(math.sqrt(pixels * shape)), height or round(math.sqrt(pixels / shape))
     focal, side = min(columns / (2 * x), rows / (2 * y)), None if width else RESOLUTION
     return [
         look_at(f"orbit_{i:04d}", position, middle, axis, width=columns, height=rows, focal=focal, resolution=side)
         for i, position in enumerate(positions)
-    ]
-
-
-def turntable(
-    subject: Subject,
-    count: int,
-    *,
-    up: Sequence[float],
-    elevation: float = ELEVATION,
-    radius: float | None = None,
-    side: int = RESOLUTION,
-    near: float = 0.2,
-) -> list[Camera]:
-    """Return the cameras of a video once around a subject: a ring with the frame of `orbit`, in another size.
-
-    Args:
-        count: Number of cameras, all different: the video continues with the first one.
-        elevation: Elevation in degrees above the scene's horizon, between -90 and 90.
-        radius: Distance of the cameras from the center in world units; None for that of `orbit`.
-        side: Length in pixels of the longer side.
-
-    Raises:
-        SettingsError: If a value is out of range; see `orbit`.
-    """
-    axis = _checked(count, up, (elevation,), radius, (side, side))
-    directions = ring_directions(count, axis, (elevation,))
-    positions, middle, (x, y) = _standpoints(subject, directions, axis, radius, near)
-    width, height = (max(1, round(side * min(1.0, ratio))) for ratio in (_shape(x, y), 1 / _shape(x, y)))
-    focal = min(width / (2 * x), height / (2 * y))
-    return [
-        look_at(f"turn_{index:05d}", position, middle, axis, width=width, height=height, focal=focal)
-        for index, position in enumerate(positions)
     ]
 
 
@@ -573,28 +546,6 @@ def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: f
     return distance
 
 
-def _standpoints(
-    subject: Subject, directions: Sequence[Tensor], up: Tensor, radius: float | None, near: float
-) -> tuple[list[Tensor], Tensor, tuple[float, float]]:
-    """Place cameras around a subject.
-
-    Args:
-        directions: Unit vectors [3] from the center to the cameras.
-        radius: Distance of the cameras from the center; None for the smallest one that suits all.
-
-    Returns:
-        Positions [3] of the cameras, the center [3], and half the width and height at depth 1 that show the subject
-            from all of them.
-    """
-    middle = middle_of(subject, up)
-    if radius is None:
-        radius = _distance(subject.hull - middle, directions, up, near)
-    positions = [middle + radius * direction for direction in directions]
-    halves = torch.stack([_half_extents(subject, position, middle, up, near) for position in positions])
-    x, y = halves.amax(0).tolist()
-    return positions, middle, (x, y)
-
-
 def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> Tensor:
     """Return half the width and height [2] at depth 1 that show a subject from a position, with a margin.
 
@@ -606,7 +557,7 @@ def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor
     visible = local[local[:, 2] > near]
     slopes = (visible[:, :2] / visible[:, 2:]).abs().clamp_max(_WIDEST)
     least = slopes.new_full((1, 2), 1e-3 * subject.size / float((target - position).norm()) + 1e-6)
-    return _MARGIN * torch.cat([slopes, least]).amax(0)
+    return torch.cat([slopes, least]).amax(0).mul(_MARGIN)
 
 
 def _shape(x: float, y: float) -> float:

@@ -25,7 +25,6 @@ from sgsst_core.orbit import (
     middle_of,
     orbit,
     orbit_decisions,
-    turntable,
 )
 from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import make_rasterizer
@@ -385,26 +384,11 @@ def test_invalid_orbit_arguments_are_refused(wrong: dict[str, object]) -> None:
         orbit(scene_of(torch.rand(9, 3)), **arguments)  # type: ignore[arg-type]
 
 
-def test_turntable_keeps_focal_length_target_and_frame_and_shows_all_of_the_object() -> None:
-    means = box((-0.5, -1.5, -0.3), (0.5, 1.5, 0.3), 3000) + torch.tensor([5.0, -7.0, 2.0])
-    subject = find_subject(scene_of(means, 0.01))
-    views = turntable(subject, 40, up=UP, elevation=20, side=400)
-    assert len({(view.width, view.height, view.fx, view.fy, view.cx, view.cy) for view in views}) == 1
-    assert max(views[0].width, views[0].height) == 400
-    assert all(bool(in_view(view, means).all()) for view in views)
-    middle = middle_of(subject, torch.tensor(UP, dtype=torch.float64))
-    assert all(torch.allclose(project(view, middle[None])[0], torch.tensor([0.5, 0.5]).double()) for view in views)
-    centers = torch.stack([view.center for view in views])
-    steps = (centers - centers.roll(1, 0)).norm(dim=1)  # the last camera is one step before the first
+def test_ring_is_closed() -> None:
+    """A video of the views of a ring continues with the first one."""
+    centers = torch.stack([view.center for view in orbit(figure(), 40, up=UP, elevations=[20.0])])
+    steps = (centers - centers.roll(1, 0)).norm(dim=1)
     assert torch.allclose(steps, steps[0].expand(40))
-
-
-def test_turntable_of_a_point_or_from_within_is_finite() -> None:
-    point = find_subject(scene_of(torch.zeros(1, 3), 1e-6))
-    inside = find_subject(scene_of(box((-1, -1, -1), (1, 1, 1), 2000), 0.01))
-    for views in (turntable(point, 3, up=UP), turntable(inside, 3, up=UP, radius=0.1)):
-        assert all(math.isfinite(view.fx) and view.fx > 0 for view in views)
-        assert all(bool(torch.isfinite(view.world_to_camera).all()) for view in views)
 
 
 REQUEST = OrbitRequest(count=12)
