@@ -31,8 +31,6 @@ LARGE_COEFFICIENT = 20.0
 #: Distance from the world's origin, in scene extents, at which float32 positions have a spacing of about a thousandth
 #: of the extent.
 FAR_WORLD = 1e4
-#: Standard deviation below which a style image counts as untextured: one gray level.
-FLAT_STYLE = 1.0 / 255.0
 #: Number of Gaussians from which the scene's extent is estimated.
 _SAMPLE = 50_000
 
@@ -141,19 +139,10 @@ def view_findings(cameras: Sequence[Camera], survey: Survey) -> list[Finding]:
 
 
 def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
-    """Return the findings about a style image [H, W, 3]."""
-    height, width = int(style.shape[0]), int(style.shape[1])
-    findings = []
-    spread = float(style.double().std(dim=(0, 1), correction=0).max())
-    if spread < FLAT_STYLE:
-        done = "its features hardly vary, so the scene is pulled toward one flat color"
-        findings.append(Finding("style", "one color throughout", 1, 1, f"standard deviation {spread:.2g}", done))
-    used = [style_size((height, width), (camera.height, camera.width)) for camera in cameras]
-    tiny = [size for size in used if min(size) < ALIGNMENT]
-    if tiny:
-        done = f"feature layers without a cell are skipped in the loss; use an image of at least {ALIGNMENT} pixels"
-        smallest = min(tiny, key=min)
-        findings.append(
-            Finding("style", "too small for deep layers", 1, 1, f"used at {smallest[1]} x {smallest[0]}", done)
-        )
-    return findings
+    """Return a finding about a style image [H, W, 3] that is too small for the views."""
+    size = (int(style.shape[0]), int(style.shape[1]))
+    height, width = min((style_size(size, (camera.height, camera.width)) for camera in cameras), key=min)
+    if min(height, width) >= ALIGNMENT:
+        return []
+    done = f"feature layers without a cell are skipped in the loss; use an image of at least {ALIGNMENT} pixels"
+    return [Finding("style", "too small for deep layers", 1, 1, f"used at {width} x {height}", done)]

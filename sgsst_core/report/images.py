@@ -189,15 +189,11 @@ def write_frames(
     """
     for index, camera in enumerate(cameras):
         fraction = 1.0 if unstylized is None else _shown_fraction(index / max(len(cameras) - 1, 1))
-        if unstylized is None or fraction == 1:
-            image = layer.image(camera, alpha=alpha)
-        elif fraction == 0:
-            image = unstylized.image(camera, alpha=alpha)
-        else:
-            before, after = unstylized.image(camera, alpha=alpha), layer.image(camera, alpha=alpha)
-            line = round(fraction * before.shape[1])
-            wiped = torch.cat([after[:, :line], before[:, line:]], dim=1)
-            image = wiped if transition == "wipe" else torch.lerp(before, after, fraction)
+        image = layer.image(camera, alpha=alpha)
+        if unstylized is not None and fraction < 1:
+            before, line = unstylized.image(camera, alpha=alpha), round(fraction * image.shape[1])
+            wiped = torch.cat([image[:, :line], before[:, line:]], dim=1)
+            image = wiped if transition == "wipe" else torch.lerp(before, image, fraction)
         write(_to_bytes(image))
         progress(index + 1, len(cameras))
 
