@@ -208,17 +208,21 @@ class Up:
     ground: bool = False
 
     @property
+    def axis(self) -> str:
+        """World axis nearest to the direction, such as "-y"."""
+        axis = int(self.direction.abs().argmax())
+        return ("-" if self.direction[axis] < 0 else "") + "xyz"[axis]
+
+    @property
     def candidates(self) -> list[str]:
         """World axis nearest to the direction, or both conventions if the scene does not determine it."""
-        return [Up(_nearest_axis(self.direction), "").name] if self.sure else [*_CONVENTIONS]
+        return [self.axis] if self.sure else [*_CONVENTIONS]
 
     @property
     def name(self) -> str:
         """Axis such as "-y", or the three components of another direction."""
-        axis = int(self.direction.abs().argmax())
-        sign = "-" if self.direction[axis] < 0 else ""
-        if float(self.direction[axis].abs()) > 1 - 1e-9:
-            return sign + "xyz"[axis]
+        if float(self.direction.abs().amax()) > 1 - 1e-9:
+            return self.axis
         return "(" + ", ".join(f"{value:.2f}" for value in self.direction.tolist()) + ")"
 
 
@@ -268,15 +272,9 @@ def _standing(subject: Subject, axes: Tensor) -> Up | None:
 def _snapped(direction: Tensor, close: float = _SNAP) -> Tensor:
     """Return the nearest world axis if the cosine to it is at least `close`, else the direction itself."""
     direction = direction / direction.norm()
-    axis = _nearest_axis(direction)
-    return axis if float(direction @ axis) >= close else direction
-
-
-def _nearest_axis(direction: Tensor) -> Tensor:
-    """Return the world axis [3] nearest to a direction [3]."""
     largest, axis = int(direction.abs().argmax()), torch.zeros(3, dtype=torch.float64)
     axis[largest] = direction[largest].sign()
-    return axis
+    return axis if float(direction @ axis) >= close else direction
 
 
 def _axes_of(points: Tensor, weights: Tensor) -> Tensor:
@@ -463,11 +461,8 @@ def orbit(
     subject = scene if isinstance(scene, Subject) else find_subject(scene)
     directions = ring_directions(count, axis, elevations)
     middle = middle_of(subject, axis)
-    if radius is None:
-        radius = _distance(subject.hull - middle, directions, axis, near)
+    radius, x, y = _framing(subject, middle, directions, axis, radius, near)
     positions = [middle + radius * direction for direction in directions]
-    halves = torch.stack([_half_extents(subject, position, middle, axis, near) for position in positions])
-    x, y = halves.amax(0).tolist()
     pixels, shape = _PIXELS * RESOLUTION**2, _shape(x, y)
     columns, rows = width or round(math.sqrt(pixels * shape)), height or round(math.sqrt(pixels / shape))
     focal, side = min(columns / (2 * x), rows / (2 * y)), None if width else RESOLUTION
@@ -533,31 +528,31 @@ def _checked(
     return unit
 
 
-def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: float) -> float:
-    """Return the smallest distance at which all cameras see all points, given their offsets [D, 3] from the center."""
-    origin = torch.zeros(3, dtype=torch.float64)
-    distance = 0.0
-    for direction in directions:
-        rotation = look_at("", direction, origin, up, width=1, height=1, focal=1.0).world_to_camera[:3, :3]
-        x, y, z = (offsets @ rotation.T).unbind(1)
-        # in view: |x| focal <= (distance + z) / 2, and the same for y; in front: distance + z >= near
-        needed = (2 * _FOCAL * _MARGIN * torch.maximum(x.abs(), y.abs())).clamp_min(_NEAR_MARGIN * near)
-        distance = max(distance, float((needed - z).max()))
-    return distance
-
-
-def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> Tensor:
-    """Return half the width and height [2] at depth 1 that show a subject from a position, with a margin.
+def _framing(
+    subject: Subject, middle: Tensor, directions: Sequence[Tensor], up: Tensor, radius: float | None, near: float
+) -> tuple[float, float, float]:
+    """Return the distance of cameras from the center, and half the width and height at depth 1 that all must show.
 
     A single point has no extent, so it gets a small one. With that of the pixel blur, it would look the same from any
     distance.
+
+    Args:
+        middle: [3], center, which the cameras look at.
+        directions: Unit vectors [3] from the center to the cameras.
+        radius: Distance of the cameras; None for the smallest one at which all of them see the subject.
     """
-    pose = look_at("", position, target, up, width=1, height=1, focal=1.0).world_to_camera
-    local = subject.hull @ pose[:3, :3].T + pose[:3, 3]
-    visible = local[local[:, 2] > near]
-    slopes = (visible[:, :2] / visible[:, 2:]).abs().clamp_max(_WIDEST)
-    least = slopes.new_full((1, 2), 1e-3 * subject.size / float((target - position).norm()) + 1e-6)
-    return torch.cat([slopes, least]).amax(0).mul(_MARGIN)
+    origin = torch.zeros(3, dtype=torch.float64)
+    poses = [look_at("", each, origin, up, width=1, height=1, focal=1.0).world_to_camera for each in directions]
+    local = torch.stack([(subject.hull - middle) @ pose[:3, :3].T for pose in poses])
+    across, z = local[:, :, :2].abs(), local[:, :, 2:]
+    if radius is None:
+        # in view: |x| focal <= (radius + z) / 2, and the same for y; in front: radius + z >= near
+        needed = (2 * _FOCAL * _MARGIN * across.amax(2, keepdim=True)).clamp_min(_NEAR_MARGIN * near)
+        radius = float((needed - z).max())
+    depths = z + radius
+    slopes = torch.where(depths > near, across / depths, 0.0).clamp_max(_WIDEST)
+    x, y = slopes.amax((0, 1)).clamp_min(1e-3 * subject.size / radius + 1e-6).mul(_MARGIN).tolist()
+    return radius, x, y
 
 
 def _shape(x: float, y: float) -> float:

@@ -79,7 +79,7 @@ class NovelViews:
         weighted: Whether to weight statistics by rendered coverage, as the job does.
         lpips: LPIPS network; None skips LPIPS.
         most: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
-        memory: Memory budget in bytes for coverage, colors, warps and images. What does not fit is recomputed.
+        memory: Memory budget in bytes for colors, warps and images. What does not fit is recomputed.
         maps: Region maps that match `style_targets`; None if the scene has no regions.
 
     Attributes:
@@ -129,7 +129,6 @@ class NovelViews:
         self.views = [index for index in views if index in seeing]
         self.pairs = {gap: [pair for pair in pairs if seeing.issuperset(pair)] for gap, pairs in chosen.items()}
         self._colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 8)
-        self._coverage: Cache[int, Tensor] = Cache(memory // 8, tensor_bytes)
         self._warps: Cache[tuple[int, int], Warp] = Cache(memory // 2, lambda warp: warp.nbytes)
         self._image_memory = memory // 4
 
@@ -165,9 +164,7 @@ class NovelViews:
         values: dict[int, list[float]] = {}
         for done, index in enumerate(self.views):
             show(done, len(self.views))
-            coverage = None
-            if self.weighted:
-                coverage = self._coverage.get(index, partial(self.rasterizer.coverage, self.cameras[index]))
+            coverage = self.rasterizer.coverage(self.cameras[index]) if self.weighted else None
             target = self._loss.targets.of_view(image(index), coverage)
             if self._maps is not None:
                 fractions = self._maps.render(self.cameras[index]).unbind(2)
@@ -261,10 +258,7 @@ def consistency(
         warp: Function that returns the warp of a pair's second view into the first one.
         lpips: LPIPS network; None skips LPIPS.
     """
-    results = []
-    for first, second in pairs:
-        warped, valid = warp(first, second).apply(image(second))
-        results.append(compare(image(first), warped, valid, lpips))
+    results = [compare(image(first), *warp(first, second).apply(image(second)), lpips) for first, second in pairs]
     compared, rmse, distances = zip(*results, strict=True)
     return Consistency(gap, len(results), sum(compared) / len(results), _mean(rmse), _mean(distances))
 

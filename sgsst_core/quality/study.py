@@ -23,7 +23,6 @@ from torch import Tensor
 from sgsst_core.errors import InvalidInputError, SettingsError
 from sgsst_core.files.atomic import atomic_path, write_json
 from sgsst_core.files.images import to_image
-from sgsst_core.scene.colors import resize_area
 from sgsst_core.settings import reason
 
 #: Number of variants that a page can compare: one for each arrow key.
@@ -140,9 +139,9 @@ def write_study(
     environment = Environment(
         loader=PackageLoader("sgsst_core.quality"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    scale = min(1.0, _STYLE_SIDE / max(style.shape[:2]))
-    small = resize_area(style, (max(1, round(style.shape[0] * scale)), max(1, round(style.shape[1] * scale))))
-    text = environment.get_template("study.html").render(style=_data_uri(small), data=data, count=len(names))
+    text = environment.get_template("study.html").render(
+        style=_data_uri(style, _STYLE_SIDE), data=data, count=len(names)
+    )
     with atomic_path(page) as temporary:
         temporary.write_text(text, encoding="utf-8")
         write_json(key, Key(study=study, variants=list(names), views=tokens).model_dump())  # no page without its key
@@ -195,8 +194,9 @@ def _read(kind: type[F], path: Path) -> F:
         raise StudyError(f"{path}: not {what}: {where}: {reason(first)}.") from error
 
 
-def _data_uri(image: Tensor) -> str:
-    """Return an image [H, W, 3] in 0..1 as a data URI with a JPEG."""
-    buffer = io.BytesIO()
-    to_image(image).save(buffer, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
+def _data_uri(image: Tensor, most: int = 1 << 16) -> str:
+    """Return an image [H, W, 3] in 0..1 as a data URI with a JPEG, with at most `most` pixels per side."""
+    buffer, picture = io.BytesIO(), to_image(image)
+    picture.thumbnail((most, most))
+    picture.save(buffer, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
