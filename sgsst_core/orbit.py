@@ -524,8 +524,7 @@ def _checked(
         raise SettingsError(f"An orbit with up = {list(up)} and elevation = {angles} degrees has no direction.")
     if radius is not None and not (radius > 0 and math.isfinite(radius)):
         raise SettingsError(f"An orbit's radius is {radius:g}; give a number above 0.")
-    unit: Tensor = axis / axis.norm()
-    return unit
+    return torch.nn.functional.normalize(axis, dim=0, eps=0.0)
 
 
 def _framing(
@@ -622,9 +621,8 @@ def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = N
         elevations = tuple(angle for angle in _RINGS if angle > 0)
     if request.count is not None:
         elevations = elevations[: max(1, request.count // _MIN_VIEWS)]
-    count = request.count
-    if count is None:
-        count = sum(max(_MIN_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
+    by_ring = (max(_MIN_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
+    count = sum(by_ring) if request.count is None else request.count
     axis, radius = up.direction.tolist(), request.radius
     cameras = orbit(subject, count, up=axis, elevations=elevations, radius=radius, near=request.near)
     radius = float((cameras[0].center - middle_of(subject, up.direction)).norm())

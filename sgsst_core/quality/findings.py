@@ -95,7 +95,13 @@ def scene_findings(file: SceneFile) -> list[Finding]:
     reached = "--target-loss may be reached at once, because they raise the initial loss"
     what = f"DC SH coefficients above {LARGE_COEFFICIENT:g}"
     findings += _extreme(file, what, scene.sh_dc.abs().amax(dim=1), LARGE_COEFFICIENT, f"{cubed}; {reached}")
-    return findings + _far_from_origin(file, center, extent)
+    far = float(center.norm()) / extent
+    if far >= FAR_WORLD:
+        step = float(np.spacing(np.float32(center.abs().max())))
+        done = "float32 positions are too coarse here; subtract an offset from those of Gaussians and cameras"
+        worst = f"center {far:.3g} extents away; positions are {step:.3g} apart, {step / extent:.1e} of the extent"
+        findings.append(Finding("scene", "scene far from its origin", total, total, worst, done))
+    return findings
 
 
 def _extreme(file: SceneFile, what: str, values: Tensor, bound: float, done: str) -> list[Finding]:
@@ -105,16 +111,6 @@ def _extreme(file: SceneFile, what: str, values: Tensor, bound: float, done: str
         return []
     row = index if file.retained is None else int(np.flatnonzero(file.retained)[index])
     return [Finding("scene", what, count, len(values), f"Gaussian {row}: {float(values[index]):.3g}", done)]
-
-
-def _far_from_origin(file: SceneFile, center: Tensor, extent: float) -> list[Finding]:
-    far, total = float(center.norm()) / extent, len(file.scene)
-    if far < FAR_WORLD:
-        return []
-    step = float(np.spacing(np.float32(center.abs().max())))
-    done = "float32 positions are too coarse here; subtract an offset from those of Gaussians and cameras"
-    worst = f"center {far:.3g} extents away; positions are {step:.3g} apart, {step / extent:.1e} of the extent"
-    return [Finding("scene", "scene far from its origin", total, total, worst, done)]
 
 
 def _scene_extent(scene: Scene) -> tuple[Tensor, float]:

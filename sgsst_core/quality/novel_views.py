@@ -55,13 +55,12 @@ class NovelViewMoment:
 
     def as_dict(self, step: int, seconds: float) -> dict[str, Any]:
         """Return the measurement after `step` steps and `seconds` of optimization as JSON-serializable values."""
-        ranges = {"short": self.short, "long": self.long}
         return {
             "step": step,
             "seconds": seconds,
             "gram": {str(scale): value for scale, value in self.gram.items()},
             "gram_relative": self.gram_relative,
-            "consistency": {name: pairs and asdict(pairs) for name, pairs in ranges.items()},
+            "consistency": {"short": self.short and asdict(self.short), "long": self.long and asdict(self.long)},
         }
 
 

@@ -196,7 +196,7 @@ def _read(kind: type[F], path: Path) -> F:
 
 def _data_uri(image: Tensor, most: int = 1 << 16) -> str:
     """Return an image [H, W, 3] in 0..1 as a data URI with a JPEG, with at most `most` pixels per side."""
-    buffer, picture = io.BytesIO(), to_image(image)
-    picture.thumbnail((most, most))
-    picture.save(buffer, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
+    buffer, jpeg = io.BytesIO(), to_image(image)
+    jpeg.thumbnail((most, most))
+    jpeg.save(buffer, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
