@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,8 +15,9 @@ from torch import Tensor
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
 from sgsst_core.progress import Decision
-from sgsst_core.scene.camera import Camera, look_at
-from sgsst_core.scene.gaussians import Scene, rotations, sampled_rows
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera, look_at, resized
+from sgsst_core.scene.gaussians import Scene, rotations, sampled, sampled_rows
 
 #: Number of Gaussians sampled to compute the extent, which is then accurate to well under 1 %, and maximum number of
 #: points stored in a `Subject`.
@@ -208,21 +209,17 @@ class Up:
     ground: bool = False
 
     @property
-    def axis(self) -> str:
-        """World axis nearest to the direction, such as "-y"."""
-        axis = int(self.direction.abs().argmax())
-        return ("-" if self.direction[axis] < 0 else "") + "xyz"[axis]
-
-    @property
     def candidates(self) -> list[str]:
         """World axis nearest to the direction, or both conventions if the scene does not determine it."""
-        return [self.axis] if self.sure else [*_CONVENTIONS]
+        return [Up(_nearest_axis(self.direction), "").name] if self.sure else [*_CONVENTIONS]
 
     @property
     def name(self) -> str:
         """Axis such as "-y", or the three components of another direction."""
-        if float(self.direction.abs().amax()) > 1 - 1e-9:
-            return self.axis
+        axis = int(self.direction.abs().argmax())
+        sign = "-" if self.direction[axis] < 0 else ""
+        if float(self.direction[axis].abs()) > 1 - 1e-9:
+            return sign + "xyz"[axis]
         return "(" + ", ".join(f"{value:.2f}" for value in self.direction.tolist()) + ")"
 
 
@@ -265,16 +262,23 @@ def _standing(subject: Subject, axes: Tensor) -> Up | None:
     ends = [_foot(subject, long), _foot(subject, -long)]
     if max(ends) <= max(_MIN_FOOT, _WIDER * min(ends)):
         return None
-    reason = f"the subject is {longer:.1f} times as tall as wide, and its foot is broader than the other end"
+    broader = f"{max(ends) / min(ends):.1f} times as broad as" if max(ends) < 100 * min(ends) else "broader than"
+    reason = f"the subject is {longer:.1f} times as tall as wide, and its foot is {broader} the other end"
     return Up(_snapped(long if ends[0] > ends[1] else -long, _SNAP_STANDING), reason)
 
 
 def _snapped(direction: Tensor, close: float = _SNAP) -> Tensor:
     """Return the nearest world axis if the cosine to it is at least `close`, else the direction itself."""
     direction = direction / direction.norm()
+    axis = _nearest_axis(direction)
+    return axis if float(direction @ axis) >= close else direction
+
+
+def _nearest_axis(direction: Tensor) -> Tensor:
+    """Return the world axis [3] nearest to a direction [3]."""
     largest, axis = int(direction.abs().argmax()), torch.zeros(3, dtype=torch.float64)
     axis[largest] = direction[largest].sign()
-    return axis if float(direction @ axis) >= close else direction
+    return axis
 
 
 def _axes_of(points: Tensor, weights: Tensor) -> Tensor:
@@ -340,7 +344,7 @@ def _covered_fraction(points: Tensor, up: Tensor, rows: Tensor) -> float:
 
     Areas are counted in grid cells.
     """
-    flat = points @ _level_frame(up)[:, :2]
+    flat = points @ _across(up)
     low = flat.amin(0)
     side = float((flat.amax(0) - low).amax())
     if not side > 0:
@@ -374,7 +378,7 @@ def _balance(subject: Subject, up: Tensor) -> float:
 def _base(subject: Subject, up: Tensor, thickness: float) -> tuple[Tensor, Tensor]:
     """Return all points [P, 2] and the lowest ones, seen from above; `thickness` is a fraction of the height."""
     heights = subject.points @ up
-    flat = subject.points @ _level_frame(up)[:, :2]
+    flat = subject.points @ _across(up)
     # quantiles, so that neither strays nor the few points of a hollow base below its rim count as a foot
     low, high = (quantile(heights, subject.weights, fraction) for fraction in (0.01, 0.99))
     return flat, flat[heights <= low + thickness * (high - low)]
@@ -390,15 +394,13 @@ def _area(points: Tensor) -> float:
         return 0.0
 
 
-def _level_frame(up: Tensor) -> Tensor:
-    """Return unit vectors as columns [3, 3]: horizontally to the first camera, horizontally to its side, and up.
-
-    The first camera stands in the direction of world z, or of x if up is close to z.
-    """
+def _across(up: Tensor) -> Tensor:
+    """Return two unit vectors perpendicular to `up` and each other, [3, 2] as columns."""
     first = torch.zeros(3, dtype=torch.float64)
-    first[2 if abs(float(up[2])) < 0.9 else 0] = 1.0
-    first = torch.nn.functional.normalize(first - (first @ up) * up, dim=0)
-    return torch.stack([first, torch.linalg.cross(up, first), up], dim=1)
+    first[int(up.abs().argmin())] = 1.0
+    first = torch.linalg.cross(up, first)
+    first = first / first.norm()
+    return torch.stack([first, torch.linalg.cross(up, first)], dim=1)
 
 
 #: Default resolution of an orbit: its views have as many pixels as 1024x768.
@@ -412,13 +414,17 @@ ELEVATION = 10.0
 _FOCAL = 1.5
 #: Margin around the subject, as a factor of its extent in the frame.
 _MARGIN = 1.03
-#: Aspect ratios (width over height) are powers of `_STEP`, a quarter octave. They are at most `_MAX_STEPS` steps from
-#: square, which is 4 to 1.
+#: Aspect ratios (width over height) are powers of `_STEP`, a quarter octave, so that an orbit has few different sizes.
+#: They are at most `_MAX_STEPS` steps from square, which is 4 to 1.
 _STEP, _MAX_STEPS = 2**0.25, 8
+#: Minimum area of a frame as a fraction of the largest, so that stroke sizes stay within half an octave.
+_SMALLEST = 0.5
 #: Minimum distance of the subject's nearest point, as a multiple of the near plane.
 _NEAR_MARGIN = 1.1
 #: Tangent of the maximum half field of view, for cameras that an explicit radius places inside the subject.
 _WIDEST = math.tan(math.radians(50))
+#: If the ratio of the subject's smaller to its larger horizontal spread is at least this, it has no broad side.
+_ROUND = 0.9
 
 
 def orbit(
@@ -432,11 +438,10 @@ def orbit(
     height: int | None = None,
     near: float = 0.2,
 ) -> list[Camera]:
-    """Return cameras on rings around the subject of a scene, all at the same distance and with the same frame.
+    """Return cameras on rings around the subject of a scene, all at the same distance, each framed to fit the subject.
 
-    Stray Gaussians and background are ignored (`find_subject`). The cameras look at the center of the subject. The
-    frame fits it from every camera; its aspect ratio follows the subject's shape, and it has as many pixels as
-    1024x768.
+    Stray Gaussians and background are ignored (`find_subject`). The cameras look at the center of the visible part of
+    the subject. Aspect ratios follow its shape, and every frame has as many pixels as 1024x768.
 
     Args:
         count: Number of cameras, distributed over the rings so that neighbors are about equally far apart.
@@ -444,8 +449,8 @@ def orbit(
         elevations: Elevation of each ring above the scene's horizon in degrees, between -90 and 90.
         radius: Distance of the cameras from the center in world units; None for the smallest distance at which the
             subject fits in a field of view of 37 degrees from every camera.
-        width: Width of the frame in pixels; None to follow the shape of the subject.
-        height: Height of the frame in pixels; None to follow the shape of the subject.
+        width: Width in pixels of every frame; None to follow the shape of the subject.
+        height: Height in pixels of every frame; None to follow the shape of the subject.
         near: Near plane of the rasterizer in world units; cameras stay at least that far from the subject.
 
     Raises:
@@ -459,33 +464,86 @@ def orbit(
     """
     axis = _checked(count, up, elevations, radius, (width, height))
     subject = scene if isinstance(scene, Subject) else find_subject(scene)
-    directions = ring_directions(count, axis, elevations)
-    middle = middle_of(subject, axis)
-    radius, x, y = _framing(subject, middle, directions, axis, radius, near)
-    positions = [middle + radius * direction for direction in directions]
-    pixels, shape = _PIXELS * RESOLUTION**2, _shape(x, y)
-    columns, rows = width or round(math.sqrt(pixels * shape)), height or round(math.sqrt(pixels / shape))
-    focal, side = min(columns / (2 * x), rows / (2 * y)), None if width else RESOLUTION
+    directions, middle = ring_directions(subject, count, axis, elevations), middle_of(subject, axis)
+    if radius is None:
+        radius = _distance(subject.hull - middle, directions, axis, near)
+    frames = []
+    for direction in directions:
+        target, half = _frame(subject, middle, radius * direction, axis, near)
+        shape = width / height if width and height else _shape(half)
+        frames.append((middle + radius * direction, target, shape, _widened(half, shape)))
+    least = _SMALLEST * max(x * y for *_, (x, y) in frames)
+    cameras = []
+    for i, (position, target, shape, (x, y)) in enumerate(frames):
+        wider = math.sqrt(max(1.0, least / (x * y)))
+        pixels = _PIXELS * RESOLUTION**2
+        columns, rows = width or round(math.sqrt(pixels * shape)), height or round(math.sqrt(pixels / shape))
+        focal = min(columns / (2 * x * wider), rows / (2 * y * wider))
+        side = None if width else RESOLUTION
+        cameras.append(
+            look_at(f"orbit_{i:04d}", position, target, axis, width=columns, height=rows, focal=focal, resolution=side)
+        )
+    return cameras
+
+
+def turntable(
+    subject: Subject,
+    count: int,
+    *,
+    up: Sequence[float],
+    elevation: float = ELEVATION,
+    radius: float | None = None,
+    side: int = RESOLUTION,
+    near: float = 0.2,
+) -> list[Camera]:
+    """Return the cameras of a video once around a subject: a ring of one frame size, focal length and target.
+
+    The frame fits the subject from every camera, in the aspect ratio of `orbit`.
+
+    Args:
+        count: Number of cameras, all different: the video continues with the first one.
+        elevation: Elevation in degrees above the scene's horizon, between -90 and 90.
+        radius: Distance of the cameras from the center in world units; None for that of `orbit`.
+        side: Length in pixels of the longer side.
+
+    Raises:
+        SettingsError: If a value is out of range; see `orbit`.
+    """
+    axis = _checked(count, up, (elevation,), radius, (side, side))
+    directions, middle = ring_directions(subject, count, axis, (elevation,)), middle_of(subject, axis)
+    if radius is None:
+        radius = _distance(subject.hull - middle, directions, axis, near)
+    halves = [_half_extents(subject, middle + radius * direction, middle, axis, near) for direction in directions]
+    half = (max(x for x, _ in halves), max(y for _, y in halves))
+    shape = _shape(half)
+    x, y = _widened(half, shape)
+    width, height = (max(1, round(side * min(1.0, ratio))) for ratio in (shape, 1 / shape))
+    focal = min(width / (2 * x), height / (2 * y))
     return [
-        look_at(f"orbit_{i:04d}", position, middle, axis, width=columns, height=rows, focal=focal, resolution=side)
-        for i, position in enumerate(positions)
+        look_at(f"turn_{index:05d}", middle + radius * direction, middle, axis, width=width, height=height, focal=focal)
+        for index, direction in enumerate(directions)
     ]
 
 
 def cameras_per_ring(count: int, elevations: Sequence[float]) -> list[int]:
-    """Distribute `count` cameras over the rings by circumference."""
-    lengths = np.cos(np.radians(elevations))
-    ends = np.rint(count * lengths.cumsum() / lengths.sum()).astype(int)
-    counts: list[int] = np.diff(ends, prepend=0).tolist()
+    """Distribute `count` cameras over the rings by circumference, at least one per ring if there are enough cameras."""
+    lengths = [math.cos(math.radians(elevation)) for elevation in elevations]
+    quotas = [count * length / sum(lengths) for length in lengths]
+    counts = [max(1, math.floor(quota)) for quota in quotas]
+    order = sorted(range(len(quotas)), key=lambda ring: math.floor(quotas[ring]) - quotas[ring])
+    for ring in order:
+        counts[ring] += sum(counts) < count
+    while sum(counts) > count:  # more rings than cameras
+        counts[max(range(len(counts)), key=lambda ring: (counts[ring], ring))] -= 1
     return counts
 
 
-def ring_directions(count: int, up: Tensor, elevations: Sequence[float]) -> list[Tensor]:
+def ring_directions(subject: Subject, count: int, up: Tensor, elevations: Sequence[float]) -> list[Tensor]:
     """Return unit vectors [3] from the center to the cameras, ring by ring.
 
     Every second ring is rotated by half the angle between its cameras.
     """
-    start, side, _ = _level_frame(up).T
+    start, side, _ = _level_frame(subject, up).T
     directions = []
     for ring, (number, elevation) in enumerate(zip(cameras_per_ring(count, elevations), elevations, strict=True)):
         tilt = math.radians(elevation)
@@ -501,9 +559,15 @@ def middle_of(subject: Subject, up: Tensor) -> Tensor:
 
     A median would be unsuitable: that of a standing figure, for example, is not at half its height.
     """
-    frame = _level_frame(up)
+    frame = _level_frame(subject, up)
     local = subject.hull @ frame
     return frame @ ((local.amin(0) + local.amax(0)) / 2)
+
+
+def _level_frame(subject: Subject, up: Tensor) -> Tensor:
+    """Return unit vectors as columns [3, 3]: horizontally to the first camera, horizontally to its side, and up."""
+    front = _front(subject, up)
+    return torch.stack([front, torch.linalg.cross(up, front), up], dim=1)
 
 
 def _checked(
@@ -524,49 +588,119 @@ def _checked(
         raise SettingsError(f"An orbit with up = {list(up)} and elevation = {angles} degrees has no direction.")
     if radius is not None and not (radius > 0 and math.isfinite(radius)):
         raise SettingsError(f"An orbit's radius is {radius:g}; give a number above 0.")
-    return torch.nn.functional.normalize(axis, dim=0, eps=0.0)
+    unit: Tensor = axis / axis.norm()
+    return unit
 
 
-def _framing(
-    subject: Subject, middle: Tensor, directions: Sequence[Tensor], up: Tensor, radius: float | None, near: float
-) -> tuple[float, float, float]:
-    """Return the distance of cameras from the center, and half the width and height at depth 1 that all must show.
+def _front(subject: Subject, up: Tensor) -> Tensor:
+    """Return the horizontal direction [3] to the first camera, which faces the subject's broad side if it has one."""
+    start = torch.zeros(3, dtype=torch.float64)
+    start[2 if abs(float(up[2])) < 0.9 else 0] = 1.0  # any direction that is not (nearly) parallel to up
+    start = torch.nn.functional.normalize(start - (start @ up) * up, dim=0)
+    frame = torch.stack([start, torch.linalg.cross(up, start)], dim=1)
+    flat = (subject.points - subject.points[0]) @ frame
+    flat = flat - (subject.weights[:, None] * flat).sum(0)
+    flat = flat / flat.abs().amax().clamp_min(1e-300)
+    spreads, axes = torch.linalg.eigh((subject.weights[:, None] * flat).T @ flat)
+    if not float(spreads[0]) < _ROUND**2 * float(spreads[1]):
+        return start
+    # Of the two broad sides, take the one from which more protrudes; if they are similar, the one on the positive z
+    # side.
+    skew = float((subject.weights * (flat @ axes[:, 0]) ** 3).sum()) / max(float(spreads[0]), 1e-100) ** 1.5
+    sense = skew if abs(skew) > 0.05 else float(axes[0, 0]) or 1.0
+    level: Tensor = math.copysign(1.0, sense) * (frame @ axes[:, 0])
+    return level
+
+
+def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: float) -> float:
+    """Return the smallest distance at which all cameras see all points, given their offsets [D, 3] from the center."""
+    origin = torch.zeros(3, dtype=torch.float64)
+    distance = 0.0
+    for direction in directions:
+        rotation = look_at("", direction, origin, up, width=1, height=1, focal=1.0).world_to_camera[:3, :3]
+        x, y, z = (offsets @ rotation.T).unbind(1)
+        # in view: |x| focal <= (distance + z) / 2, and the same for y; in front: distance + z >= near
+        needed = (2 * _FOCAL * _MARGIN * torch.maximum(x.abs(), y.abs())).clamp_min(_NEAR_MARGIN * near)
+        distance = max(distance, float((needed - z).max()))
+    return distance
+
+
+def _frame(
+    subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: float
+) -> tuple[Tensor, tuple[float, float]]:
+    """Return the target [3] in the middle of what a camera at an offset from the center sees of the subject.
+
+    Returns:
+        The target, and half the width and height at depth 1 that the camera must show.
+    """
+    position, target = middle + offset, middle
+    half = (0.0, 0.0)
+    for _ in range(5):
+        rotation, slopes = _slopes(subject, position, target, up, near)
+        if not len(slopes):
+            break
+        half = (float(slopes[:, 0].abs().amax()), float(slopes[:, 1].abs().amax()))
+        aim = torch.cat([(slopes.amin(0) + slopes.amax(0)) / 2, torch.ones(1, dtype=torch.float64)])
+        if float(aim[:2].abs().amax()) < 1e-3 * max(half):
+            break
+        target = position + float(offset.norm()) * (rotation.T @ aim)
+    return target, _with_margin(half, subject, float(offset.norm()))
+
+
+def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> tuple[float, float]:
+    """Return half the width and height at depth 1 that show a subject from a position toward a target."""
+    slopes = _slopes(subject, position, target, up, near)[1]
+    half = slopes.abs().amax(0).tolist() if len(slopes) else (0.0, 0.0)
+    return _with_margin(half, subject, float((target - position).norm()))
+
+
+def _slopes(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> tuple[Tensor, Tensor]:
+    """Return a camera's rotation [3, 3], and the x and y [n, 2] of the visible subject at depth 1."""
+    pose = look_at("", position, target, up, width=1, height=1, focal=1.0).world_to_camera
+    local = subject.hull @ pose[:3, :3].T + pose[:3, 3]
+    visible = local[local[:, 2] > near]
+    return pose[:3, :3], (visible[:, :2] / visible[:, 2:]).clamp(-_WIDEST, _WIDEST)
+
+
+def _with_margin(half: Sequence[float], subject: Subject, distance: float) -> tuple[float, float]:
+    """Return half extents with a margin around the subject.
 
     A single point has no extent, so it gets a small one. With that of the pixel blur, it would look the same from any
     distance.
-
-    Args:
-        middle: [3], center, which the cameras look at.
-        directions: Unit vectors [3] from the center to the cameras.
-        radius: Distance of the cameras; None for the smallest one at which all of them see the subject.
     """
-    origin = torch.zeros(3, dtype=torch.float64)
-    poses = [look_at("", each, origin, up, width=1, height=1, focal=1.0).world_to_camera for each in directions]
-    local = torch.stack([(subject.hull - middle) @ pose[:3, :3].T for pose in poses])
-    across, z = local[:, :, :2].abs(), local[:, :, 2:]
-    if radius is None:
-        # in view: |x| focal <= (radius + z) / 2, and the same for y; in front: radius + z >= near
-        needed = (2 * _FOCAL * _MARGIN * across.amax(2, keepdim=True)).clamp_min(_NEAR_MARGIN * near)
-        radius = float((needed - z).max())
-    depths = z + radius
-    slopes = torch.where(depths > near, across / depths, 0.0).clamp_max(_WIDEST)
-    x, y = slopes.amax((0, 1)).clamp_min(1e-3 * subject.size / radius + 1e-6).mul(_MARGIN).tolist()
-    return radius, x, y
+    least = 1e-3 * subject.size / distance + 1e-6
+    return _MARGIN * max(half[0], least), _MARGIN * max(half[1], least)
 
 
-def _shape(x: float, y: float) -> float:
+def _shape(half: tuple[float, float]) -> float:
     """Return the permitted aspect ratio (width over height) that is nearest to that of the half extents."""
-    steps = round(math.log(x / y) / math.log(_STEP))
+    steps = round(math.log(half[0] / half[1]) / math.log(_STEP))
     return float(_STEP ** max(-_MAX_STEPS, min(_MAX_STEPS, steps)))
 
 
-#: Elevations in degrees of an orbit's rings, the most important first. Rings below the horizon are only for an isolated
+def _widened(half: tuple[float, float], shape: float) -> tuple[float, float]:
+    """Return the half extents of the smallest frame of an aspect ratio that contains these half extents."""
+    x, y = half
+    return (max(x, y * shape), max(y, x / shape))
+
+
+#: Elevations in degrees of rings that may be added to the first. Rings below the horizon are only for an isolated
 #: subject, without ground or background.
-_RINGS = (ELEVATION, 40.0, 70.0, -20.0)
+_ABOVE, _BELOW = (40.0, 70.0), (-20.0,)
+#: Minimum fraction of the surface that a ring must add.
+_LITTLE = 0.03
 #: Default number of views of a ring at elevation 0. All rings together then have 49 views.
 _AROUND = 16
 #: Minimum number of views per ring if there are several rings.
 _MIN_VIEWS = 6
+#: Fraction of its largest visible area from which on a surface counts as fully seen: that of a surface rotated by 45
+#: degrees.
+_ENOUGH = 0.7
+#: A surface counts as inside the scene if views show less than the first fraction of its area. The second is the
+#: maximum fraction of such surfaces without a warning.
+_HARDLY, _INSIDE = 0.02, 0.3
+#: Trial views: number in a ring at elevation 0, resolution, and number of sampled Gaussians.
+_TRIALS, _TRIAL_SIDE, _TRIAL_GAUSSIANS = 8, 160, 50_000
 
 
 @dataclass(frozen=True)
@@ -575,7 +709,7 @@ class OrbitRequest:
 
     Attributes:
         up: [3], world direction of up.
-        elevation: Elevation in degrees of the orbit's only ring; None for as many rings as `count` suffices for.
+        elevation: Elevation in degrees of the orbit's only ring; None to choose one or several rings.
         radius: Distance of the cameras from the center in world units.
     """
 
@@ -595,14 +729,20 @@ class Orbit:
         up: Up direction with its reason.
         elevations: Elevations of the rings in degrees.
         radius: Distance of the cameras from the center of the subject in world units.
+        tried: Elevations that were tried.
+        shown: Surface that the rings show, as a fraction of what all tried rings would show.
         outside: Fraction of the scene that is not part of the subject.
+        inside: Fraction of the surface that no trial view shows.
     """
 
     cameras: list[Camera]
     up: Up
     elevations: tuple[float, ...]
     radius: float
+    tried: tuple[float, ...]
+    shown: float
     outside: float
+    inside: float
 
 
 def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = None) -> Orbit:
@@ -610,23 +750,29 @@ def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = N
 
     Args:
         remaining: [N] bool, Gaussians of a cropped scene that the orbit surrounds; None for all. The others may still
-            show where up is.
+            hide them, and show where up is.
 
     Raises:
         SettingsError: If an option is out of range; see `orbit`.
     """
     subject, up = find_upright_subject(scene, request.up, remaining)
-    elevations: tuple[float, ...] = (request.elevation,) if request.elevation is not None else _RINGS
-    if request.elevation is None and (up.ground or subject.left_out > _WHOLE):
-        elevations = tuple(angle for angle in _RINGS if angle > 0)
-    if request.count is not None:
-        elevations = elevations[: max(1, request.count // _MIN_VIEWS)]
-    by_ring = (max(_MIN_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
-    count = sum(by_ring) if request.count is None else request.count
-    axis, radius = up.direction.tolist(), request.radius
-    cameras = orbit(subject, count, up=axis, elevations=elevations, radius=radius, near=request.near)
+    first = ELEVATION if request.elevation is None else request.elevation
+    rings = request.count // _MIN_VIEWS if request.count is not None else 1 + len(_ABOVE + _BELOW)
+    tried = [first]
+    if request.elevation is None and rings > 1:
+        alone = not up.ground and subject.left_out <= _WHOLE
+        tried += [*_ABOVE, *(_BELOW if alone else ())]
+    trial = _Trial(scene, subject, up, request, remaining)
+    areas = [trial.of_ring(elevation) for elevation in tried]
+    chosen, shown = _needed(areas, max(rings, 1))
+    elevations = tuple(tried[ring] for ring in chosen)
+    count = request.count
+    if count is None:
+        count = sum(max(_MIN_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
+    cameras = trial.cameras(count, elevations)
     radius = float((cameras[0].center - middle_of(subject, up.direction)).norm())
-    return Orbit(cameras, up, elevations, radius, subject.left_out)
+    inside = trial.hidden_fraction(areas)
+    return Orbit(cameras, up, elevations, radius, tuple(tried), shown, subject.left_out, inside)
 
 
 def find_upright_subject(
@@ -654,13 +800,95 @@ def orbit_decisions(orbit: Orbit, count: int) -> list[Decision]:
     *others, last = [f"{angle:g}" for angle in orbit.elevations]
     angles = f"{', '.join(others)} and {last}" if others else last
     rings = f"{len(orbit.elevations)} rings" if len(orbit.elevations) > 1 else "a ring"
-    reason = "views from several heights show more of the surface" if others else "requested"
+    reason = "requested"
+    if len(orbit.tried) > 1:
+        tried = f"rings at {min(orbit.tried):g} to {max(orbit.tried):g} degrees"
+        reason = f"they show {orbit.shown:.0%} of the surface that {tried} show"
     views = f"{count} view{'s' if count > 1 else ''}"
     decisions.append(
         Decision("cameras", f"{views} in {rings} at {angles} degrees, {orbit.radius:.3g} from the center", reason)
     )
-    if orbit.outside > _WHOLE:
-        better = "it is not a single object; the cameras of its capture (--cameras) would show it better"
-        text = f"warning: {orbit.outside:.0%} of the scene lies outside the frames"
-        decisions.append(Decision("subject", text, better))
+    outside = f"{orbit.outside:.0%} of the scene lies outside the frames"
+    inside = f"{orbit.inside:.0%} of the scene lies inside, hidden from all views around it"
+    doubts = (
+        (orbit.outside > _WHOLE, outside, "it is not a single object"),
+        (orbit.inside > _INSIDE, inside, "it may be a room"),
+    )
+    for doubted, text, reason in doubts:
+        if doubted:
+            better = f"{reason}; the cameras of its capture (--cameras) would show it better"
+            decisions.append(Decision("subject", f"warning: {text}", better))
     return decisions
+
+
+class _Trial:
+    """Renderer of small trial views of a scene, or of an enlarged sample of its Gaussians, for comparing rings."""
+
+    def __init__(self, scene: Scene, subject: Subject, up: Up, request: OrbitRequest, remaining: Tensor | None) -> None:
+        self._subject, self._up, self._request = subject, up, request
+        colorless = replace(scene, sh_rest=scene.means.new_zeros((len(scene), 0, 3)))
+        self._scene = sampled(colorless, _TRIAL_GAUSSIANS)
+        self._rasterizer = make_rasterizer("cpu", self._scene, near=request.near)
+        self._cropped = None if remaining is None else ~remaining[sampled_rows(len(scene), _TRIAL_GAUSSIANS)]
+
+    def cameras(self, count: int, elevations: Sequence[float]) -> list[Camera]:
+        """Return the cameras of the orbit with these rings."""
+        axis, request = self._up.direction.tolist(), self._request
+        return orbit(self._subject, count, up=axis, elevations=elevations, radius=request.radius, near=request.near)
+
+    def hidden_fraction(self, areas: Sequence[Tensor]) -> float:
+        """Return the fraction of the surface that is hidden from all rings, given the areas [n] that each shows."""
+        lengths = self._scene.scales.double().clamp(-60, 60).exp().sort(dim=1).values
+        surface = 2 * math.pi * torch.sigmoid(self._scene.opacities.double()) * lengths[:, 1] * lengths[:, 2]
+        if self._cropped is not None:
+            surface[self._cropped] = 0
+        shown = torch.stack(list(areas)).amax(0)
+        return float(surface[shown < _HARDLY * surface].sum() / surface.sum().clamp_min(1e-300))
+
+    def of_ring(self, elevation: float) -> Tensor:
+        """Return the visible area of each Gaussian in the trial view of a ring that shows most of it, [n].
+
+        Areas are in squared world units.
+        """
+        count = max(4, round(_TRIALS * math.cos(math.radians(elevation))))
+        areas = torch.zeros(len(self._scene), dtype=torch.float64)
+        for camera in self.cameras(count, [elevation]):
+            small = resized(camera, _TRIAL_SIDE)
+            weights = self._rasterizer.survey(small)[1].double()
+            depths = self._scene.means.double() @ small.world_to_camera[2, :3] + small.world_to_camera[2, 3]
+            # area of a pixel at this depth, perpendicular to the view
+            areas = torch.maximum(areas, weights * (depths / small.fx) ** 2)
+        if self._cropped is not None:
+            areas[self._cropped] = 0
+        return areas
+
+
+def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float]:
+    """Choose rings greedily: the first one, then repeatedly the one that adds most surface, until the gain is small.
+
+    For each Gaussian, the view that shows most of it counts. The surface that a set of rings shows is the sum of these
+    areas, relative to that of all rings. A Gaussian counts fully if a ring shows at least the fraction `_ENOUGH` of its
+    largest area, and in proportion below that.
+
+    Args:
+        areas: Areas [n] for each ring.
+        most: Maximum number of rings to choose.
+
+    Returns:
+        Indices of the chosen rings, ascending, and fraction of the surface that they show.
+    """
+    best_of_all = torch.stack(list(areas)).amax(0)
+    areas = [(area / _ENOUGH).minimum(best_of_all) for area in areas]
+    total = float(best_of_all.sum()) or 1.0
+    chosen, covered = [0], areas[0]
+    while True:
+        gains = {
+            ring: float((torch.maximum(covered, areas[ring]) - covered).sum()) / total
+            for ring in range(len(areas))
+            if ring not in chosen
+        }
+        best = max(gains, key=lambda ring: gains[ring], default=None)
+        if best is None or gains[best] < _LITTLE or len(chosen) >= most:
+            return sorted(chosen), float(covered.sum()) / total
+        chosen.append(best)
+        covered = torch.maximum(covered, areas[best])

@@ -44,7 +44,7 @@ from sgsst_core.files.scene_file import (
     write_usd,
 )
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
-from sgsst_core.orbit import ELEVATION, find_upright_subject, orbit
+from sgsst_core.orbit import ELEVATION, find_upright_subject, turntable
 from sgsst_core.progress import Decision, warnings_of
 from sgsst_core.quality.measure import CompressionLoss, measure_compression
 from sgsst_core.rasterizer import make_rasterizer
@@ -474,15 +474,16 @@ def video_cameras(
         return [framed(camera, side, even=even) for camera in path]
     request = orbit_request(source)
     subject, up = find_upright_subject(scene, request.up, remaining)
-    cameras = orbit(
+    cameras = turntable(
         subject,
         options.frames,
         up=up.direction.tolist(),
-        elevations=[ELEVATION if request.elevation is None else request.elevation],
+        elevation=ELEVATION if request.elevation is None else request.elevation,
         radius=request.radius,
+        side=side or DEFAULT_SIDE,
         near=request.near,
     )
-    return [framed(camera, side or DEFAULT_SIDE, even=even) for camera in cameras]
+    return [framed(camera, None, even=even) for camera in cameras]
 
 
 def _read_views(request: VideoRequest, file: SceneFile) -> Capture:
