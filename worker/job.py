@@ -23,7 +23,7 @@ CONTINUABLE = ("within", "on-request")
 GAUSSIAN_BYTES = 248
 #: Bytes that a rank needs in addition to the scene: libraries of CUDA and PyTorch, and pinned buffers.
 _RANK_BYTES = 3_000_000_000
-#: Copies of the scene on a machine while it is loaded: the arrays read from the file, and the shared memory.
+#: Copies of the scene that a rank has while it is loaded: the arrays read from the file, and those it computes with.
 _SCENE_COPIES = 2
 
 
@@ -176,4 +176,4 @@ def scene_bytes(name: str, size: int) -> int:
 
 def memory_beside_gpus(ranks: int, scene: int) -> int:
     """Estimate the host memory in bytes of `ranks` ranks on one machine with a scene of `scene` bytes."""
-    return ranks * _RANK_BYTES + _SCENE_COPIES * scene
+    return ranks * (_RANK_BYTES + _SCENE_COPIES * scene)

@@ -18,7 +18,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -34,9 +33,6 @@ from worker.processes import STOP_SIGNALS, dismiss_sweeper, start_sweeper, sweep
 #: Size of Ray's object store in bytes. The default is 30 % of all memory, but the store holds almost nothing here:
 #: torch.distributed exchanges tensors, and scenes are read from files.
 OBJECT_STORE_BYTES = 512 << 20
-#: Length of a folder's path from which it cannot hold Ray's temporary folder: the paths of Ray's sockets would exceed
-#: the system's limit of 107 bytes.
-_LONGEST_PARENT = 24
 #: Token of every Ray instance that this process starts. Ray reads the token only once.
 _SECRET = secrets.token_hex(32)
 #: Seconds in which a cluster must accept a connection.
@@ -128,11 +124,9 @@ class Cluster:
         import ray
 
         _silence_ray()
-        parent = tempfile.gettempdir()
-        short = "/tmp" if len(parent) >= _LONGEST_PARENT else parent
-        self._folder = Path(tempfile.mkdtemp(prefix="sgsst-ray-", dir=short))
+        # Paths of Ray's sockets may have 107 bytes, which those in a folder for temporary files could exceed.
+        self._folder = Path(tempfile.mkdtemp(prefix="sgsst-ray-", dir="/tmp"))
         self._sweeper = start_sweeper(self._folder)
-        earlier = set(psutil.Process().children())
         try:
             ray.init(
                 address="local",
@@ -144,16 +138,14 @@ class Cluster:
                 _temp_dir=str(self._folder),
                 _node_ip_address="127.0.0.1",
             )
-        except BaseException as error:
+        except Exception as error:
             self.close()
-            if not isinstance(error, Exception):
-                raise
             raise RanksFailedError(
                 f"Ray could not be started on this machine: {first_line(error)}. Run without --workers, or set "
                 "RAY_ADDRESS to a cluster."
             ) from error
-        started = [process for process in psutil.Process().children() if process not in earlier]
-        self._daemons = [process for process in started if _is_daemon(process)]
+        daemons = [each for each in psutil.process_iter(["name", "ppid"]) if each.info["name"] in _DAEMONS]
+        self._daemons = [each for each in daemons if each.info["ppid"] == os.getpid() and _is_running(each)]
 
     def alive(self) -> bool:
         """Return whether the daemons of a local instance run. Always True for a cluster, which is not checked."""
@@ -180,14 +172,6 @@ def _check_answers(address: str) -> None:
         socket.create_connection((host.strip("[]"), int(port)), _ANSWER_SECONDS).close()
 
 
-def _is_daemon(process: psutil.Process) -> bool:
-    """Return whether this is one of `_DAEMONS`; Ray also starts processes that soon end."""
-    try:
-        return process.name() in _DAEMONS
-    except psutil.NoSuchProcess:
-        return False
-
-
 def _is_running(process: psutil.Process) -> bool:
     """Return whether a process has not ended."""
     try:
@@ -208,12 +192,8 @@ def _silence_ray() -> None:
     worker.print_to_stdstream = lambda *arguments, **options: None
 
 
-#: Label of a Ray node that holds its ID.
-NODE_LABEL = "ray.io/node-id"
 #: Seconds to wait for resources in use. Those of lost ranks are soon free again.
 PLACE_SECONDS = 5.0
-#: Minimum time in seconds for each attempt, because Ray frees resources late on a busy machine.
-_LEAST_SECONDS = 3.0
 
 
 def first_line(error: BaseException) -> str:
@@ -228,45 +208,38 @@ class NoCapacityError(Exception):
 
 @dataclass(frozen=True)
 class Reservation:
-    """Resources for ranks; those of each rank can be released individually.
+    """Resources for ranks.
 
     Attributes:
-        groups: Ray placement group of each rank.
+        group: Ray placement group with a bundle for each rank.
+        ranks: Number of ranks.
         threads: Processor cores per rank.
         gpus: GPUs per rank, 0 or 1.
     """
 
-    groups: tuple[Any, ...]
+    group: Any
+    ranks: int
     threads: int
     gpus: int
 
-    def actor_options(self) -> list[dict[str, Any]]:
-        """Return the options of each rank's actor. Ray must not restart an actor that died."""
+    def actor_options(self, rank: int) -> dict[str, Any]:
+        """Return the options of a rank's actor. Ray must not restart an actor that died."""
         from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
-        return [
-            {
-                "num_cpus": self.threads,
-                "num_gpus": self.gpus,
-                "max_restarts": 0,
-                "max_task_retries": 0,
-                "max_concurrency": 2,
-                "scheduling_strategy": PlacementGroupSchedulingStrategy(group, placement_group_bundle_index=0),
-            }
-            for group in self.groups
-        ]
+        return {
+            "num_cpus": self.threads,
+            "num_gpus": self.gpus,
+            "max_restarts": 0,
+            "max_task_retries": 0,
+            "max_concurrency": 2,
+            "scheduling_strategy": PlacementGroupSchedulingStrategy(self.group, placement_group_bundle_index=rank),
+        }
 
     def release(self) -> None:
         """Release all resources."""
-        for group in self.groups:
-            give_back(group)
+        from ray.util import remove_placement_group
 
-
-def give_back(group: Any) -> None:
-    """Release a placement group. Releasing it twice is not an error."""
-    from ray.util import remove_placement_group
-
-    remove_placement_group(group)
+        remove_placement_group(self.group)
 
 
 def reserve(workers: int, scene: int = 0) -> Reservation:
@@ -282,39 +255,28 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
     Raises:
         NoCapacityError: If there are no free resources even for one rank.
     """
-    nodes = _nodes()
+    import ray
+    from ray.util import placement_group
+
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     gpus = sum(int(node.get("GPU", 0)) for node in nodes)
     wanted = min(workers, gpus) if gpus else workers
     cores = [int(node.get("CPU", 0)) for node in nodes]
     threads = _threads(cores, wanted)
     wanted = min(wanted, sum(count // threads for count in cores))
-    deadline = time.monotonic() + PLACE_SECONDS
     while wanted > 0:
-        groups = _places(wanted, _bundle(nodes, wanted, threads, scene), deadline)
-        if groups:
-            return Reservation(groups, threads, 1 if gpus else 0)
+        bundles = [_bundle(nodes, wanted, threads, scene)] * wanted
+        group = placement_group(bundles, strategy="PACK" if gpus else "SPREAD")
+        reservation = Reservation(group, wanted, threads, 1 if gpus else 0)
+        if group.wait(PLACE_SECONDS):
+            return reservation
+        reservation.release()
         if threads > 1 and not gpus:  # other jobs may use some of the cores
             threads = 1
         else:
             wanted -= 1
-    raise NoCapacityError(
-        f"Ray has no capacity for a worker, which needs {_in_words(_bundle(nodes, 1, threads, scene))}"
-    )
-
-
-def _in_words(bundle: dict[str, int]) -> str:
-    """Describe the resources of a rank in words."""
-    parts = [f"{bundle['CPU']} cores" if bundle["CPU"] > 1 else "a core"]
-    parts += ["a GPU"] if "GPU" in bundle else []
-    parts += [f"{bundle['memory'] / 1e9:.1f} GB of memory"] if "memory" in bundle else []
-    return " and ".join([", ".join(parts[:-1]), parts[-1]] if parts[1:] else parts)
-
-
-def _nodes() -> list[dict[str, float]]:
-    """Return the resources of every machine of the cluster."""
-    import ray
-
-    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    needed = ", ".join(f"{name} {amount:,}" for name, amount in _bundle(nodes, 1, threads, scene).items())
+    raise NoCapacityError(f"Ray has no capacity for a worker, which needs {needed}")
 
 
 def _threads(cores: list[int], ranks: int) -> int:
@@ -330,31 +292,8 @@ def _bundle(nodes: list[dict[str, float]], ranks: int, threads: int, scene: int)
     with_gpus = [node for node in nodes if node.get("GPU")]
     if not with_gpus:
         return {"CPU": threads}
-    sharing = min(ranks, max(int(node["GPU"]) for node in with_gpus))  # ranks of a machine share the scene
+    sharing = min(ranks, max(int(node["GPU"]) for node in with_gpus))
     # A job that needs more memory than any machine has gets all of the largest machine's, and may still succeed there.
-    most = max(int(node.get("memory", 0)) for node in with_gpus)
-    memory = min(memory_beside_gpus(sharing, scene), most) // sharing
+    most = max(int(node.get("memory", 0)) for node in with_gpus) // sharing
+    memory = min(memory_beside_gpus(1, scene), most)
     return {"CPU": threads, "GPU": 1, **({"memory": memory} if memory else {})}
-
-
-def _places(ranks: int, bundle: dict[str, int], deadline: float) -> tuple[Any, ...]:
-    """Return a placement group for each rank; empty if the resources are not free before the deadline.
-
-    Ray can only release all bundles of a placement group together. Therefore one group for all ranks is created first,
-    to choose the machines, and is then replaced by one group per rank on the same machines. Other jobs may take
-    resources in between, so there may be fewer groups than ranks.
-    """
-    from ray.util import placement_group, placement_group_table
-
-    together = placement_group([bundle] * ranks, strategy="PACK" if "GPU" in bundle else "SPREAD")
-    ready = together.wait(max(deadline - time.monotonic(), _LEAST_SECONDS))
-    nodes = dict(placement_group_table(together)["bundles_to_node_id"]) if ready else {}
-    give_back(together)
-    alone = [placement_group([bundle], bundle_label_selector=[{NODE_LABEL: nodes[index]}]) for index in sorted(nodes)]
-    there = []
-    for group in alone:
-        if group.wait(max(deadline - time.monotonic(), _LEAST_SECONDS)):
-            there.append(group)
-        else:
-            give_back(group)
-    return tuple(there)

@@ -5,9 +5,8 @@ Ranks notice each other's end by broken connections, and Ray's daemons end ranks
 (`worker.processes`) watches the driver, and ends what is left of its local Ray instance.
 
 An attempt is one set of ranks. An error of the job itself would occur again, so it is raised at once. After any other
-failure, the next attempt resumes the job with as many ranks as the cluster has resources for, as long as attempts make
-progress. An error that occurs twice at the same step is raised, and several attempts in a row without progress are the
-last ones.
+failure, the next attempt resumes the job with as many ranks as the cluster has resources for, until several attempts in
+a row make no progress.
 """
 
 from __future__ import annotations
@@ -17,11 +16,10 @@ import secrets
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal
 
-from sgsst_core.errors import ClusterAwayError, InfrastructureError, RanksDriftedError, RanksFailedError, SgsstError
+from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedError, SgsstError
 from worker.job import JobSpec, Result, Resume, scene_bytes
 from worker.processes import ProcessId, home, kill
 from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, first_line, reserve
@@ -34,8 +32,6 @@ if TYPE_CHECKING:
 
 #: Seconds that an interrupted job has to finish its step and save a checkpoint.
 STOP_SECONDS = 10.0
-#: Seconds that the other ranks have to exit after rank 0 is done.
-_LAST_WORDS = 5.0
 
 
 def stylize_on_ranks(
@@ -75,8 +71,8 @@ class _Attempts:
         self._workers = workers
         self._listener, self._options, self._cluster = listener, options, cluster
         self._run_id = secrets.token_hex(8)
-        self._failed: list[FailedAttempt] = []
         self._lost: list[LostAttempt] = []
+        self._in_vain = 0
         self._relay = Relay(listener, self._report_resumed)
         self._group = RankGroup()
         self._lost_at = time.monotonic()
@@ -88,16 +84,17 @@ class _Attempts:
             Exception: If the failure policy raises a rank's error.
             RanksFailedError: If the failure policy gives up.
         """
+        relay = self._relay
         while True:
-            relay, before = self._relay, self._relay.farthest
+            before = relay.farthest
             try:
                 return self._ended(self._attempt())
             except AttemptFailedError as error:
-                failure = error.failure
-            self._failed.append(FailedAttempt(failure, relay.last_step, relay.farthest != before))
+                failure = error
+            self._in_vain = 0 if relay.farthest != before else self._in_vain + 1
             count = len(self._group.handles) or self._workers
             self._lost.append(LostAttempt(count, relay.first_step, relay.last_step, relay.saved or 0, failure.reason))
-            self._listener.happened(check_retry(self._failed))
+            self._listener.happened(check_retry(failure, self._lost, self._in_vain))
             if self._listener.stop():
                 return self._ended(None)
 
@@ -125,8 +122,7 @@ class _Attempts:
             return self._watch()
         except (ray.exceptions.RayError, ConnectionError) as error:
             own = isinstance(error, ray.exceptions.RayTaskError | ray.exceptions.OutOfMemoryError)
-            kind: Literal["loss", "machine"] = "loss" if own else "machine"
-            raise AttemptFailedError(Failure(kind, f"Ray failed: {first_line(error)}", error)) from error
+            raise AttemptFailedError("loss" if own else "machine", f"Ray failed: {first_line(error)}", error) from error
         finally:
             self._lost_at = time.monotonic()
             end_ranks(self._group, self._cluster, self._options.workplace)
@@ -134,9 +130,7 @@ class _Attempts:
     def _watch(self) -> Result | None:
         first = self._group.handles[0]
         deadline: float | None = None
-        done_at: float | None = None
         finishing = False
-        said: str | None = None
         while True:
             if deadline is None and self._listener.stop():
                 deadline = time.monotonic() + STOP_SECONDS
@@ -148,14 +142,9 @@ class _Attempts:
                 return None
             poll_ranks(self._group)
             self._relay.pass_on(first.status)
-            if self._relay.before_steps and (line := long_wait(self._group)) and line != said:
-                self._listener.happened(said := line)
             if first.outcome is not None and first.outcome.error is None:
-                done_at = done_at or time.monotonic()
-                if all(rank.outcome for rank in self._group.handles) or time.monotonic() - done_at > _LAST_WORDS:
-                    return first.outcome.result
-            else:
-                look_for_losses(self._group, self._cluster, self._options.rank_timeout)
+                return first.outcome.result
+            look_for_losses(self._group, self._cluster, self._options.rank_timeout)
 
     def _task(self, number: int, address: str) -> RankTask:
         reservation, workplace = self._group.reservation, self._options.workplace
@@ -233,11 +222,6 @@ class Relay:
         """Return the highest step and the step of the last checkpoint. One of them changes with any progress."""
         return self.step, self.saved
 
-    @property
-    def before_steps(self) -> bool:
-        """Return whether the current attempt has not made a step."""
-        return self._progress is None or not self._progress.is_step
-
     def begin_attempt(self) -> None:
         """Reset the state of the current attempt for a new set of ranks."""
         self.first_step, self.last_step = None, self.saved or 0
@@ -283,12 +267,20 @@ class Relay:
 # --- ranks of one attempt ---------------------------------------------------------------------------------------------
 
 
+@dataclass(eq=False)
 class AttemptFailedError(Exception):
-    """Error if an attempt ends before its job is done."""
+    """Error if an attempt ends before its job is done.
 
-    def __init__(self, failure: Failure) -> None:
-        super().__init__(failure.reason)
-        self.failure = failure
+    Attributes:
+        kind: "job" for an error of the job itself; "machine" for ranks that were lost with their machine, the network
+            or Ray; "loss" for ranks that died or failed for another reason.
+        reason: Short description without a full stop.
+        error: Error that a rank raised; None if it died before it raised.
+    """
+
+    kind: Literal["job", "loss", "machine"]
+    reason: str
+    error: Exception | None = None
 
 
 @dataclass
@@ -296,7 +288,6 @@ class RankHandle:
     """Handle of one rank.
 
     Attributes:
-        group: Ray placement group that the actor runs in.
         place: Location of the rank's process; None until the rank has reported it.
         pending_poll: Ray reference to the response to a pending poll; None if no poll is pending.
         polled_at, answered_at: Times of the last poll and the last response, in monotonic seconds.
@@ -304,7 +295,6 @@ class RankHandle:
     """
 
     actor: Any
-    group: Any
     place: RankPlace | None = None
     pending_poll: Any = None
     polled_at: float = 0.0
@@ -328,11 +318,13 @@ class RankGroup:
 
     Attributes:
         handles: Handles of the ranks; empty until they are started.
-        reservation: Reserved resources; None before the reservation and after its release.
+        reservation: Reserved resources; None before the reservation.
+        broken_at: Time at which a rank has reported a lost connection, in monotonic seconds; None if none has.
     """
 
     handles: list[RankHandle] = field(default_factory=list)
     reservation: Reservation | None = None
+    broken_at: float | None = None
 
     def name_of(self, rank: RankHandle) -> str:
         """Return the name of a rank for messages."""
@@ -364,55 +356,23 @@ def start_ranks(group: RankGroup, workers: int, scene: int, actor: type[RankProc
     try:
         group.reservation = reserve(workers, scene)
     except NoCapacityError as error:
-        raise AttemptFailedError(Failure("loss", str(error), ClusterAwayError(f"{error}."))) from error
+        raise AttemptFailedError("loss", str(error), ClusterAwayError(f"{error}.")) from error
     kind = ray.remote(actor)
-    reserved = zip(group.reservation.actor_options(), group.reservation.groups, strict=True)
-    group.handles = [RankHandle(kind.options(**options).remote(), place) for options, place in reserved]
-    places = _from_all(group, "place")
+    options = map(group.reservation.actor_options, range(group.reservation.ranks))
+    group.handles = [RankHandle(kind.options(**each).remote()) for each in options]
+    places: list[RankPlace] = ray.get([rank.actor.place.remote() for rank in group.handles], timeout=START_SECONDS)
     for rank, place in zip(group.handles, places, strict=True):
         rank.place = place
-    group.handles = _numbered(group.handles, ray.get_runtime_context().get_node_id())
-    address = _address(group.handles)
-    _from_all(group, "start", [(make_task(number, address),) for number in range(len(group.handles))])
+    # Rank 0 writes the files, so it is a rank on this machine if there is one. Ranks of one machine follow each other.
+    here = ray.get_runtime_context().get_node_id()
+    order = sorted(range(len(places)), key=lambda index: (places[index].node != here, places[index].node))
+    group.handles, places = [group.handles[index] for index in order], [places[index] for index in order]
+    host = "127.0.0.1" if len({place.node for place in places}) == 1 else places[0].address
+    address = f"{host}:{ray.get(group.handles[0].actor.listen.remote(host), timeout=START_SECONDS)}"
+    started = [rank.actor.start.remote(make_task(number, address)) for number, rank in enumerate(group.handles)]
+    ray.get(started, timeout=START_SECONDS)
     for rank in group.handles:
         rank.answered_at = time.monotonic()
-
-
-def _from_all(group: RankGroup, method: str, arguments: list[tuple[Any, ...]] | None = None) -> list[Any]:
-    """Call a method of all ranks concurrently, and return the results."""
-    import ray
-
-    given = arguments or [()] * len(group.handles)
-    calls = [getattr(rank.actor, method).remote(*own) for rank, own in zip(group.handles, given, strict=True)]
-    return ray.get(calls, timeout=START_SECONDS)
-
-
-def _numbered(handles: list[RankHandle], here: str) -> list[RankHandle]:
-    """Return the ranks in the order of their numbers.
-
-    Rank 0 writes the files, so it is a rank on the driver's machine if there is one. Ranks of one machine get
-    consecutive numbers.
-    """
-
-    def order(rank: RankHandle) -> tuple[bool, str]:
-        place = _place(rank)
-        return place.node != here, place.node
-
-    return sorted(handles, key=order)
-
-
-def _address(handles: list[RankHandle]) -> str:
-    """Make rank 0 listen, and return its "host:port"."""
-    import ray
-
-    alone = len({_place(rank).node for rank in handles}) == 1
-    host = "127.0.0.1" if alone else _place(handles[0]).address
-    return f"{host}:{ray.get(handles[0].actor.listen.remote(host), timeout=START_SECONDS)}"
-
-
-def _place(rank: RankHandle) -> RankPlace:
-    assert rank.place is not None  # all ranks report their location before they are numbered
-    return rank.place
 
 
 #: Seconds between two polls of a rank.
@@ -443,27 +403,24 @@ def poll_ranks(group: RankGroup) -> None:
         return
     ready, _ = ray.wait(list(polls), num_returns=len(polls), timeout=POLL_SECONDS)
     for poll in ready:
-        _take_answer(group, polls[poll], poll)
-
-
-def _take_answer(group: RankGroup, rank: RankHandle, poll: Any) -> None:
-    import ray
-
-    rank.pending_poll = None
-    try:
-        rank.status = ray.get(poll, timeout=_FETCH_SECONDS)
-        rank.answered_at = time.monotonic()
-    except ray.exceptions.ActorUnavailableError:  # may be temporary: the timeout decides
-        return
-    except ray.exceptions.ActorDiedError as error:
-        reason = _reason_of_death(error)
-        raise _lost(f"{group.name_of(rank)} was lost: {reason}", machine=reason == _MACHINE_GONE) from error
-    except ray.exceptions.RayActorError as error:
-        raise _lost(f"{group.name_of(rank)} was lost: {first_line(error)}") from error
+        rank = polls[poll]
+        rank.pending_poll = None
+        try:
+            rank.status = ray.get(poll, timeout=_FETCH_SECONDS)
+            rank.answered_at = time.monotonic()
+        except ray.exceptions.ActorUnavailableError:  # may be temporary: the timeout decides
+            continue
+        except ray.exceptions.RayActorError as error:
+            reason = _reason_of_death(error)
+            raise AttemptFailedError(
+                "machine" if reason == _MACHINE_GONE else "loss", f"{group.name_of(rank)} was lost: {reason}"
+            ) from error
 
 
 def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> None:
     """Raise an error with the root cause if a rank has failed or was lost.
+
+    A rank's connection breaks when another rank ends, but it takes a moment until the driver knows which one.
 
     Args:
         cluster: Ray cluster that runs them.
@@ -472,73 +429,26 @@ def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> 
     Raises:
         AttemptFailedError: If a rank has failed or does not respond, or if Ray has ended.
     """
-    _look_for_reasons(group, cluster)
-    silent = max(group.handles, key=lambda rank: rank.silence)
-    if silent.silence > rank_timeout:
-        raise _silent(group, silent)
-    for rank in group.handles:
-        if rank.outcome is not None and rank.outcome.error is not None:
-            _wait_for_the_reason(group, cluster, rank, rank.outcome.error)
-
-
-#: Seconds of waiting for others before the first step that are reported.
-LONG_WAIT = 60.0
-
-
-def long_wait(group: RankGroup) -> str | None:
-    """Return a sentence about the ranks that wait long for others, and what these do; None if no rank waits long."""
-    waiting = [rank for rank in group.handles if rank.status.waiting > LONG_WAIT]
-    if not waiting:
-        return None
-    others = [rank for rank in group.handles if rank not in waiting and rank.outcome is None]
-    doing = [
-        f"{group.name_of(rank)} ({rank.status.progress.stage if rank.status.progress else 'reading'})"
-        for rank in others
-    ]
-    names = ", ".join(map(group.name_of, waiting))
-    return f"Waiting for more than {LONG_WAIT:.0f} s: {names}. " + (
-        f"Still at work: {', '.join(doing)}."
-        if others
-        else "All wait for each other's messages: check the network between their machines."
-    )
-
-
-def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle, error: Exception) -> NoReturn:
-    """Wait for the cause of a rank's broken connection and raise it.
-
-    A connection breaks when another rank ends, but it takes a moment until the driver knows which one.
-    """
-    started = time.monotonic()
-    while time.monotonic() - started < _GRACE:
-        poll_ranks(group)
-        _look_for_reasons(group, cluster)
-    silent = max(group.handles, key=lambda rank: rank.silence)
-    if silent.silence > _GRACE:
-        raise _silent(group, silent)
-    raise _lost(f"{group.name_of(failed)} lost its connection: {first_line(error)}", error)
-
-
-def _look_for_reasons(group: RankGroup, cluster: Cluster) -> None:
-    """Raise an error if Ray has ended, or if a rank has failed for a reason other than the loss of another rank."""
     if not cluster.alive():
-        raise _lost("Ray's own processes on this machine were lost", machine=True)
+        raise AttemptFailedError("machine", "Ray's own processes on this machine were lost")
+    now, broken = time.monotonic(), None
     for rank in group.handles:
-        outcome = rank.outcome
-        if outcome is None or outcome.error is None or outcome.echo:
+        if rank.outcome is None or rank.outcome.error is None:
             continue
-        failure = failure_of(outcome.error, group.name_of(rank))
-        if failure.kind == "loss" or isinstance(outcome.error, InfrastructureError):
-            outcome.error.add_note(f"{group.name_of(rank)}:\n{outcome.trace}")
-        raise AttemptFailedError(failure)
-
-
-def _silent(group: RankGroup, rank: RankHandle) -> AttemptFailedError:
-    remote = rank.place is not None and rank.place.process.home != home()
-    return _lost(f"{group.name_of(rank)} was lost: it has not answered for {rank.silence:.0f} s", machine=remote)
-
-
-def _lost(reason: str, error: Exception | None = None, *, machine: bool = False) -> AttemptFailedError:
-    return AttemptFailedError(Failure("machine" if machine else "loss", reason, error))
+        name, error = group.name_of(rank), rank.outcome.error
+        if not rank.outcome.echo:
+            error.add_note(f"{name}:\n{rank.outcome.trace}")
+            raise failure_of(error, name)
+        broken = broken or f"{name} lost its connection: {first_line(error)}"
+        group.broken_at = group.broken_at or now
+    waited = group.broken_at is not None and now - group.broken_at > _GRACE
+    silent = max(group.handles, key=lambda rank: rank.silence)
+    if silent.silence > (_GRACE if waited else rank_timeout):
+        remote = silent.place is not None and silent.place.process.home != home()
+        reason = f"{group.name_of(silent)} was lost: it has not answered for {silent.silence:.0f} s"
+        raise AttemptFailedError("machine" if remote else "loss", reason)
+    if waited and broken:
+        raise AttemptFailedError("loss", broken)
 
 
 def _reason_of_death(error: Exception) -> str:
@@ -559,41 +469,34 @@ _REMOTE_SECONDS = 5.0
 
 def end_ranks(group: RankGroup, cluster: Cluster, workplace: Workplace | None = None) -> None:
     """End all ranks of an attempt, release their resources, and delete the folders that they leave in a workplace."""
-    kill([rank.place.process for rank in group.handles if rank.place and rank.place.process.home == home()])
-    if cluster.alive():
-        # If a rank cannot be reached, the Ray daemon of its node ends it.
-        with contextlib.suppress(Exception):
-            _end_remote(group, workplace)
-    if workplace is not None:
-        workplace.tidy()
-    group.reservation = None
-
-
-def _end_remote(group: RankGroup, workplace: Workplace | None) -> None:
-    import ray
-
-    for rank in group.handles:
-        ray.kill(rank.actor, no_restart=True)
-    if group.reservation is not None:
-        group.reservation.release()
-    places = [rank.place for rank in group.handles if rank.place and rank.place.process.home != home()]
-    pending = [_kill_on(place).remote([place.process], workplace) for place in places]
-    if pending:
-        ray.wait(pending, num_returns=len(pending), timeout=_REMOTE_SECONDS)
-
-
-def _kill_on(place: RankPlace) -> Any:
-    """Return a Ray task that ends processes on the node of a rank."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    def end(processes: list[ProcessId], workplace: Workplace | None) -> None:
-        kill(processes)
-        if workplace is not None:
-            workplace.tidy()
+    places = [rank.place for rank in group.handles if rank.place]
+    _end([place.process for place in places if place.process.home == home()], workplace)
+    # If a rank cannot be reached, the Ray daemon of its node ends it.
+    with contextlib.suppress(Exception):
+        if not cluster.alive():
+            return
+        for rank in group.handles:
+            ray.kill(rank.actor, no_restart=True)
+        if group.reservation is not None:
+            group.reservation.release()
+        pending = []
+        for place in places:
+            if place.process.home != home():
+                strategy = NodeAffinitySchedulingStrategy(place.node, soft=False)
+                end = ray.remote(_end).options(num_cpus=0, max_retries=0, scheduling_strategy=strategy)
+                pending.append(end.remote([place.process], workplace))
+        if pending:
+            ray.wait(pending, num_returns=len(pending), timeout=_REMOTE_SECONDS)
 
-    strategy = NodeAffinitySchedulingStrategy(place.node, soft=False)
-    return ray.remote(end).options(num_cpus=0, max_retries=0, scheduling_strategy=strategy)
+
+def _end(processes: Sequence[ProcessId], workplace: Workplace | None) -> None:
+    """End processes of this machine, and delete the folders that they leave in a workplace."""
+    kill(processes)
+    if workplace is not None:
+        workplace.tidy()
 
 
 # --- policy after a failed attempt ------------------------------------------------------------------------------------
@@ -602,68 +505,36 @@ def _kill_on(place: RankPlace) -> Any:
 MOST_ATTEMPTS = 3
 
 
-@dataclass(frozen=True)
-class Failure:
-    """Cause of a failed attempt.
-
-    Attributes:
-        kind: "job" for an error of the job itself; "machine" for ranks that were lost with their machine, the network
-            or Ray; "loss" for ranks that died or failed for another reason.
-        reason: Short description without a full stop.
-        error: Error that a rank raised; None if it died before it raised.
-    """
-
-    kind: Literal["job", "loss", "machine"]
-    reason: str
-    error: Exception | None = None
-
-
-@dataclass(frozen=True)
-class FailedAttempt:
-    """Outcome of a failed attempt, for `check_retry`.
-
-    Attributes:
-        last_step: Last completed step, or the step that the attempt started from.
-        progressed: Whether the attempt completed a step or saved a checkpoint that no earlier attempt had reached.
-    """
-
-    failure: Failure
-    last_step: int
-    progressed: bool
-
-
-def failure_of(error: Exception, rank: str) -> Failure:
+def failure_of(error: Exception, rank: str) -> AttemptFailedError:
     """Classify an error that a rank raised."""
     if isinstance(error, SgsstError) and not isinstance(error, RanksDriftedError):
-        return Failure("job", str(error), error)
-    return Failure("loss", f"{rank} failed: {first_line(error)}", error)
+        return AttemptFailedError("job", str(error), error)
+    return AttemptFailedError("loss", f"{rank} failed: {first_line(error)}", error)
 
 
-def check_retry(attempts: Sequence[FailedAttempt]) -> str:
+def check_retry(failure: AttemptFailedError, attempts: Sequence[LostAttempt], in_vain: int) -> str:
     """Return a sentence about the last of these attempts if another one may help.
 
     Args:
-        attempts: All failed attempts of the job in order; at least one.
+        failure: Cause of the end of the last attempt.
+        attempts: All lost attempts of the job in order; at least one.
+        in_vain: Number of the last attempts without progress: none of them has completed a step or saved a checkpoint
+            that no earlier attempt had reached.
 
     Raises:
-        Exception: Error that a rank raised, if it is one of the job itself or occurred twice at the same step.
+        Exception: Error that a rank raised, if it is one of the job itself, or the last attempt ended with it.
         RanksFailedError: If another attempt is unlikely to help.
         ClusterAwayError: If it is unlikely to help because of a machine, the network or Ray.
     """
-    last = attempts[-1]
-    failure = last.failure
-    give_up = ClusterAwayError if failure.kind == "machine" else RanksFailedError
-    if failure.kind == "job" and failure.error is not None:
-        raise failure.error
-    ends = [(attempt.failure.reason, attempt.last_step) for attempt in attempts[-2:]]
-    if failure.error is not None and not last.progressed and len(ends) == 2 and ends[0] == ends[1]:
-        if isinstance(failure.error, SgsstError | MemoryError | RuntimeError):
-            raise failure.error
-        raise give_up(f"{failure.reason}; the same happened twice at step {last.last_step}.") from failure.error
-    in_vain = len(list(takewhile(lambda attempt: not attempt.progressed, reversed(attempts))))
+    error = failure.error
+    if error is not None and failure.kind == "job":
+        raise error
     if in_vain >= MOST_ATTEMPTS:
+        if isinstance(error, SgsstError | MemoryError | RuntimeError):
+            raise error
         farthest = max(attempt.last_step for attempt in attempts)
+        give_up = ClusterAwayError if failure.kind == "machine" else RanksFailedError
         raise give_up(
             f"{in_vain} attempts in a row came no further than step {farthest}. The last one: {failure.reason}."
-        ) from failure.error
-    return f"{failure.reason}, after step {last.last_step}."
+        ) from error
+    return f"{failure.reason}, after step {attempts[-1].last_step}."

@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import os
 import socket
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import timedelta
 from ipaddress import ip_address
 from typing import Any, TypeVar
@@ -40,32 +38,6 @@ PREPARING = timedelta(minutes=30)
 ITERATIONS = 5
 
 
-class Waiting:
-    """Record of whether this process waits for other ranks.
-
-    Attributes:
-        since: Start of the present exchange in monotonic seconds; None while there is none.
-    """
-
-    since: float | None = None
-
-    def __enter__(self) -> None:
-        self.since = time.monotonic()
-
-    def __exit__(self, *error: object) -> None:
-        self.since = None
-
-    @property
-    def seconds(self) -> float:
-        """Seconds since the start of the present exchange; 0 while there is none."""
-        since = self.since
-        return 0.0 if since is None else time.monotonic() - since
-
-
-#: Record of this process, which is one rank of one job.
-WAITING = Waiting()
-
-
 @contextmanager
 def process_group(
     rank: int,
@@ -82,7 +54,7 @@ def process_group(
         rank: Rank of this process, 0 to size - 1.
         size: Number of ranks; for a single rank, no group is formed.
         address: Address "host:port" at which rank 0 listens.
-        device: Device of this rank, which holds the tensors of all exchanges.
+        device: Device of this rank, which holds the tensors of all exchanges; a GPU with its index.
         timeout: Timeout of each exchange after `Collectives.set_timeout_for` was called.
         listener: Socket that rank 0 listens on; None opens one at the address.
     """
@@ -91,14 +63,13 @@ def process_group(
         return
     patience = max(timeout, PREPARING)
     _stay_on_interface(address)
-    with WAITING:
-        device, sharing, store = _meet(rank, size, address, with_index(device), patience, listener)
-        if device.type == "cuda":
-            torch.cuda.set_device(device)
-        backend = _backend(device, sharing)
-        dist.init_process_group(
-            backend, store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device, backend)
-        )
+    device, sharing, store = _meet(rank, size, address, torch.device(device), patience, listener)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    backend = _backend(device, sharing)
+    dist.init_process_group(
+        backend, store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device, backend)
+    )
     # Subgroups get connections of their own, which ranks that are left out do not close. With a bound device, they
     # would be split off from those of this group.
     world: Any = dist.group.WORLD
@@ -171,29 +142,10 @@ def _named(device: torch.device, backend: str) -> torch.device | None:
     return device if "nccl" in backend else None
 
 
-def with_index(device: torch.device | str) -> torch.device:
-    """Return the device, and add the current index to a GPU without one. `torch.cuda.set_device` and NCCL need it."""
-    indexed = torch.device(device)
-    if indexed.type == "cuda" and indexed.index is None:
-        return torch.device("cuda", torch.cuda.current_device())
-    return indexed
-
-
-@dataclass(frozen=True)
-class _Stack:
-    """Statistics of several parts with the same number of channels: count [k, 1], mean [k, c], centered [k, c, c]."""
-
-    count: Tensor
-    mean: Tensor
-    centered: Tensor
-
-    @staticmethod
-    def of(parts: Sequence[LayerStatistics]) -> _Stack:
-        return _Stack(
-            torch.stack([part.count for part in parts])[:, None],
-            torch.stack([part.mean for part in parts]),
-            torch.stack([part.centered for part in parts]),
-        )
+def _stacked(parts: Sequence[LayerStatistics]) -> LayerStatistics:
+    """Stack statistics of the same number of channels: count [k, 1], mean [k, c], centered [k, c, c]."""
+    counts, means, moments = zip(*((part.count[None], part.mean, part.centered) for part in parts), strict=True)
+    return LayerStatistics(torch.stack(counts), torch.stack(means), torch.stack(moments))
 
 
 class ProcessGroupCollectives(Collectives):
@@ -267,8 +219,7 @@ class ProcessGroupCollectives(Collectives):
         )
         into = flat.new_empty(sum(expected))
         self.sent["image"] += flat.nbytes
-        with WAITING:
-            dist.all_to_all_single(into, flat, expected, counts, group=self._group)
+        dist.all_to_all_single(into, flat, expected, counts, group=self._group)
         values = iter(into.split([image[rank].numel() for rank in others for image in received]))
         for rank in range(self.size):
             for source, target in zip(sent, received, strict=True):
@@ -285,8 +236,7 @@ class ProcessGroupCollectives(Collectives):
     def _reduce(self, tensor: Tensor, traffic: Traffic, operation: Any = dist.ReduceOp.SUM) -> Tensor:
         tensor = tensor.contiguous()
         self.sent[traffic] += 2 * (self.size - 1) * tensor.nbytes // self.size
-        with WAITING:
-            dist.all_reduce(tensor, operation, group=self._group)
+        dist.all_reduce(tensor, operation, group=self._group)
         return tensor
 
     def all_reduce_statistics(
@@ -306,7 +256,7 @@ class ProcessGroupCollectives(Collectives):
         indices: dict[int, list[int]] = {}
         for index, part in enumerate(parts):
             indices.setdefault(len(part.mean), []).append(index)
-        stacks = [_Stack.of([parts[index] for index in some]) for some in indices.values()]
+        stacks = [_stacked([parts[index] for index in some]) for some in indices.values()]
         sums = [torch.cat([stack.count, stack.count * stack.mean], dim=1) for stack in stacks]
         flat = self.all_reduce(torch.cat([*(each.flatten() for each in sums), numbers]), "statistics")
         *totals, added = flat.split([*(each.numel() for each in sums), len(numbers)])
@@ -348,13 +298,11 @@ class ProcessGroupCollectives(Collectives):
         """See `Collectives`."""
         message = encode(value)
         sizes = [torch.empty(1, dtype=torch.int64) for _ in range(self.size)]
-        with WAITING:
-            dist.all_gather(sizes, torch.tensor([len(message)]), group=self._group)
+        dist.all_gather(sizes, torch.tensor([len(message)]), group=self._group)
         padded = message.new_zeros(int(max(sizes)))
         padded[: len(message)] = message
         messages = [torch.empty_like(padded) for _ in range(self.size)]
-        with WAITING:
-            dist.all_gather(messages, padded, group=self._group)
+        dist.all_gather(messages, padded, group=self._group)
         return [decode(each[: int(size)]) for each, size in zip(messages, sizes, strict=True)]
 
     def broadcast(self, make: Callable[[], T]) -> T:
@@ -366,11 +314,10 @@ class ProcessGroupCollectives(Collectives):
             except SgsstError as error:
                 message = encode((None, error))
         size = torch.tensor([len(message)])
-        with WAITING:
-            dist.broadcast(size, group=self._group, group_src=0)
-            if self.rank != 0:
-                message = message.new_empty(int(size))
-            dist.broadcast(message, group=self._group, group_src=0)
+        dist.broadcast(size, group=self._group, group_src=0)
+        if self.rank != 0:
+            message = message.new_empty(int(size))
+        dist.broadcast(message, group=self._group, group_src=0)
         value: T
         value, problem = decode(message)
         if problem is not None:
@@ -393,8 +340,7 @@ class ProcessGroupCollectives(Collectives):
             return self
         if len(ranks) == 1:
             return ALONE if self.rank in ranks else None
-        with WAITING:
-            group = dist.new_group(list(ranks), timeout=max(self._timeout, PREPARING), device_id=self._named)
+        group = dist.new_group(list(ranks), timeout=max(self._timeout, PREPARING), device_id=self._named)
         if self.rank not in ranks:
             return None
         return ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing, self.sent)

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from sgsst_core.progress import Progress
     from worker.job import JobSpec, Result, Resume
     from worker.prepare import Prepared
-    from worker.ranks.process_group import Waiting
 
 #: Seconds by which the timeout of an exchange between ranks exceeds the driver's. The driver should time out first,
 #: because it knows which rank does not respond.
@@ -180,7 +179,6 @@ class RankStatus:
         progress: Latest progress; None before the first stage. Steps are reported on rank 0 only.
         saved: Step of the last checkpoint. With a workplace, a checkpoint counts once it is stored.
         stored: Descriptions of all files that a workplace has stored so far.
-        waiting: Seconds for which the rank has been waiting for others; 0 if it is not.
     """
 
     prepared: Prepared | None = None
@@ -189,7 +187,6 @@ class RankStatus:
     warnings: tuple[str, ...] = ()
     stored: tuple[Any, ...] = ()
     outcome: Outcome | None = None
-    waiting: float = 0.0
 
 
 class RankProcess:
@@ -197,7 +194,6 @@ class RankProcess:
 
     def __init__(self) -> None:
         self._status = RankStatus()
-        self._waiting: Waiting | None = None  # set once PyTorch is imported
         self._stop, self._finish = threading.Event(), threading.Event()
         self._lock = threading.Lock()
         self._listener: socket.socket | None = None
@@ -226,8 +222,7 @@ class RankProcess:
 
     def poll(self) -> RankStatus:
         """Return the current status. Any response shows the driver that this process is alive."""
-        with self._lock:
-            return replace(self._status, waiting=self._waiting.seconds if self._waiting else 0.0)
+        return self._status
 
     def stop(self) -> None:
         """Interrupt the job after the current step. The driver calls this on rank 0 only."""
@@ -249,11 +244,14 @@ class RankProcess:
 
             # If the variable is not set, a process without an assigned GPU sees all GPUs.
             os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(str(number) for number in ray.get_gpu_ids())
-            if task.options.workplace is None:
-                _enter_folder(task)
-            else:
+            if task.options.workplace is not None:
                 place = task.options.workplace.open(task.rank, self._add_stored)
-                os.chdir(place.folder)
+            elif not task.folder.is_dir():
+                raise InfrastructureError(
+                    f"The folder {task.folder} is not on {socket.gethostname()}. Machines that take part in a job need "
+                    "it under this name, or a service whose files are in an object store."
+                )
+            os.chdir(place.folder if place else task.folder)
             self._work(task, place)
         except BaseException as error:
             if self._status.outcome is None:  # an error after the job is done does not matter
@@ -270,9 +268,8 @@ class RankProcess:
     def _work(self, task: RankTask, place: OpenWorkplace | None) -> None:
         import torch
 
-        from worker.ranks.process_group import WAITING, process_group
+        from worker.ranks.process_group import process_group
 
-        self._waiting = WAITING
         torch.set_num_threads(task.threads)
         device = torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else "cpu"
         timeout = timedelta(seconds=task.options.rank_timeout + _PATIENCE)
@@ -326,29 +323,6 @@ class RankProcess:
             self._status = replace(self._status, stored=(*self._status.stored, file), saved=saved)
 
 
-def _enter_folder(task: RankTask) -> None:
-    """Change to the base folder of relative paths.
-
-    Raises:
-        InfrastructureError: If the folder does not exist on this machine, and the job has relative paths.
-    """
-    if task.folder.is_dir():
-        os.chdir(task.folder)
-    elif not all(path.is_absolute() for path in _paths(task.request)):
-        raise InfrastructureError(
-            f"The folder {task.folder} is not on {socket.gethostname()}. Machines that take part in a job need it "
-            "under this name, or a service whose files are in an object store."
-        )
-
-
-def _paths(request: JobSpec) -> list[Path]:
-    """Return all paths of a request that are not None."""
-    styles = [*request.styles, *(style for region in request.regions for style in region.styles)]
-    masks = [region.selection.path for region in request.regions if region.selection]
-    paths = [request.source.scene, request.source.cameras, *(style.path for style in styles), *masks]
-    return [path for path in [*paths, request.images, request.out] if path is not None]
-
-
 def set_thread_variables(threads: int) -> None:
     """Set the number of threads for libraries that have not been imported yet.
 
@@ -373,11 +347,5 @@ def _failure(error: BaseException) -> Outcome:
 
 def _raised_in_exchange(error: BaseException) -> bool:
     """Return whether an error was raised inside torch.distributed, including its store."""
-    if type(error).__module__.startswith("torch.distributed"):
-        return True
-    step = error.__traceback__
-    while step is not None:
-        if str(step.tb_frame.f_globals.get("__name__", "")).startswith("torch.distributed"):
-            return True
-        step = step.tb_next
-    return False
+    frames = [frame.f_globals.get("__name__") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return any(str(name).startswith("torch.distributed") for name in (type(error).__module__, *frames))

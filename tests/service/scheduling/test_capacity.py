@@ -143,8 +143,8 @@ def test_gpu_jobs_wait_for_host_memory() -> None:
     capacity = Capacity(machine(8), None)
     alone = granted(capacity, job(200 * GB, workers=1), waiting=1)  # were it too big: it may try
     assert alone.host_bytes == 3 * GB + 400 * GB
-    first = granted(capacity, job(20 * GB, workers=4))
-    assert first.host_bytes == 4 * 3 * GB + 40 * GB
+    first = granted(capacity, job(5 * GB, workers=4))
+    assert first.host_bytes == 4 * (3 * GB + 10 * GB)
     assert capacity.grant(job(15 * GB, workers=1), [first], 9) is None, "52 + 33 GB are more than four fifths of 100 GB"
     assert granted(capacity, job(10 * GB, workers=1), [first]).gpus == ("gpu4",)
 

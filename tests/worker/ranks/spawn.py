@@ -29,7 +29,7 @@ def on_ranks(
     """Run function(collectives, *arguments) on `size` ranks, and return all results. Raise the first error of a rank.
 
     The function and its arguments must be picklable. Collective operations time out after `timeout` seconds. With the
-    device "cuda", each rank has a simulated GPU. Rank 0 listens on the address `host`.
+    device "cuda:0", each rank has a simulated GPU. Rank 0 listens on the address `host`.
     """
     address = f"{host}:{free_port()}"
     futures = [_pool().submit(_run, rank, size, address, timeout, device, function, arguments) for rank in range(size)]
@@ -57,7 +57,7 @@ def _run(
 ) -> Any:
     torch.set_num_threads(1)
     with (
-        pretend_cuda() if device == "cuda" else nullcontext(),
+        nullcontext() if device == "cpu" else pretend_cuda(),
         process_group(rank, size, address, device=device, timeout=timedelta(seconds=timeout)) as collectives,
     ):
         return function(collectives, *arguments)

@@ -14,84 +14,63 @@ from sgsst_core.progress import Progress
 from worker.job import memory_beside_gpus, scene_bytes
 from worker.prepare import Prepared
 from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, reserve
-from worker.ranks.driver import MOST_ATTEMPTS, FailedAttempt, Failure, Relay, check_retry, failure_of
+from worker.ranks.driver import MOST_ATTEMPTS, AttemptFailedError, Relay, check_retry, failure_of
 from worker.ranks.rank import RankStatus
-from worker.run import Listener
+from worker.run import Listener, LostAttempt
 
-KILLED = Failure("loss", "Worker 1 on here was lost: its process was killed")
-
-
-def failed(failure: Failure = KILLED, last_step: int = 0, *, progressed: bool = False) -> FailedAttempt:
-    return FailedAttempt(failure, last_step, progressed)
+KILLED = AttemptFailedError("loss", "Worker 1 on here was lost: its process was killed")
 
 
-def raised(error: Exception) -> Failure:
+def lost(*last_steps: int) -> list[LostAttempt]:
+    return [LostAttempt(2, 0, step, step, "") for step in last_steps]
+
+
+def raised(error: Exception) -> AttemptFailedError:
     return failure_of(error, "Worker 0 on here")
 
 
 def test_job_error_is_raised_at_once() -> None:
     error = SceneError("scene.ply: is truncated.")
-    for attempts in ([failed(raised(error))], [failed(), failed(raised(error), 7, progressed=True)]):
-        with pytest.raises(SceneError) as info:
-            check_retry(attempts)
-        assert info.value is error
+    with pytest.raises(SceneError) as info:
+        check_retry(raised(error), lost(0, 7), 0)
+    assert info.value is error
 
 
 def test_drifted_ranks_are_retried() -> None:
     failure = raised(RanksDriftedError("Rank 1 has other colors."))
     assert failure.kind == "loss"
-    assert check_retry([failed(failure, 5)]) == "Worker 0 on here failed: Rank 1 has other colors, after step 5."
+    expected = "Worker 0 on here failed: Rank 1 has other colors, after step 5."
+    assert check_retry(failure, lost(5), 1) == expected
 
 
-@pytest.mark.parametrize("progressed", [True, False])
-def test_first_lost_rank_is_retried(progressed: bool) -> None:
+@pytest.mark.parametrize("in_vain", range(MOST_ATTEMPTS))
+def test_lost_ranks_are_retried_until_attempts_are_in_vain(in_vain: int) -> None:
     expected = "Worker 1 on here was lost: its process was killed, after step 8."
-    assert check_retry([failed(last_step=8, progressed=progressed)]) == expected
-
-
-def test_lost_ranks_are_retried_while_attempts_progress() -> None:
-    attempts = [failed(last_step=step, progressed=True) for step in range(0, 200, 10)]
-    in_vain = [failed(last_step=190)] * (MOST_ATTEMPTS - 1)
-    for more in ([], in_vain, [*in_vain, failed(last_step=200, progressed=True)]):
-        assert check_retry([*attempts, *more])
+    assert check_retry(KILLED, lost(*range(0, 200, 10), 8), in_vain) == expected
 
 
 @pytest.mark.parametrize(("kind", "error"), [("loss", RanksFailedError), ("machine", ClusterAwayError)])
 def test_too_many_attempts_without_progress_give_up(kind: Literal["loss", "machine"], error: type[Exception]) -> None:
-    attempts = [failed(last_step=30, progressed=True), *[failed(replace(KILLED, kind=kind), 20)] * MOST_ATTEMPTS]
     with pytest.raises(error) as info:
-        check_retry(attempts)
+        check_retry(AttemptFailedError(kind, KILLED.reason), lost(30, 20, 20, 20), MOST_ATTEMPTS)
     assert str(info.value) == (
         "3 attempts in a row came no further than step 30. The last one: Worker 1 on here was lost: its process was "
         "killed."
     )
 
 
-def twice(error: Exception, second: Exception | None = None, steps: tuple[int, int] = (4, 4)) -> str:
-    """Check two attempts that made no progress and ended with these errors."""
-    return check_retry([failed(raised(error), steps[0]), failed(raised(second or error), steps[1])])
-
-
 @pytest.mark.parametrize(
-    "error", [RuntimeError("CUDA error"), MemoryError("can't allocate"), RanksDriftedError("Rank 1 drifted.")]
+    ("error", "expected"),
+    [
+        (RuntimeError("CUDA error"), RuntimeError),
+        (MemoryError("can't allocate"), MemoryError),
+        (RanksDriftedError("Rank 1 drifted."), RanksDriftedError),
+        (KeyError("a"), RanksFailedError),
+    ],
 )
-def test_repeated_error_at_same_step_is_raised(error: Exception) -> None:
-    with pytest.raises(type(error)) as info:
-        twice(error)
-    assert info.value is error
-
-
-def test_repeated_error_of_other_type_gives_up_with_a_sentence() -> None:
-    with pytest.raises(RanksFailedError) as info:
-        twice(KeyError("a"))
-    assert str(info.value) == "Worker 0 on here failed: 'a'; the same happened twice at step 4."
-
-
-def test_different_error_step_or_progress_is_retried() -> None:
-    error = RuntimeError("CUDA error")
-    assert twice(error, RuntimeError("NCCL error"))
-    assert twice(error, steps=(4, 5))
-    assert check_retry([failed(raised(error), 4, progressed=True)] * 2)
+def test_error_of_last_attempt_is_raised(error: Exception, expected: type[Exception]) -> None:
+    with pytest.raises(expected):
+        check_retry(raised(error), lost(4, 4, 4), MOST_ATTEMPTS)
 
 
 class EventRecorder:
@@ -170,7 +149,7 @@ GB = 1_000_000_000
 def test_scene_memory_is_its_decompressed_size() -> None:
     assert (scene_bytes("room.ply", GB), scene_bytes("ROOM.SPZ", 25_000_000)) == (GB, 248_000_000)
     assert scene_bytes("room.compressed.ply", 61_000_000) == 248_000_000
-    assert memory_beside_gpus(4, 5 * GB) == 22 * GB, "ranks of a machine share the scene"
+    assert memory_beside_gpus(4, 5 * GB) == 52 * GB, "every rank reads the scene"
 
 
 GPUS, MANY_CORES = {"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}, {"CPU": 64.0, "memory": 500.0 * GB}
@@ -180,15 +159,14 @@ GPUS, MANY_CORES = {"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}, {"CPU": 64.0
     ("nodes", "ranks", "scene", "resources"),
     [
         ([GPUS, MANY_CORES], 1, 5 * GB, {"GPU": 1, "memory": 13 * GB}),
-        ([GPUS, MANY_CORES], 2, 5 * GB, {"GPU": 1, "memory": 8 * GB}),
-        ([GPUS, MANY_CORES, GPUS], 8, 5 * GB, {"GPU": 1, "memory": 5.5 * GB}),  # four on each machine
+        ([GPUS, MANY_CORES, GPUS], 8, 5 * GB, {"GPU": 1, "memory": 13 * GB}),  # four on each machine
         ([GPUS], 1, 200 * GB, {"GPU": 1, "memory": 100 * GB}),  # a whole machine's
         ([GPUS], 4, 200 * GB, {"GPU": 1, "memory": 25 * GB}),
         ([{"CPU": 32.0, "memory": 100.0 * GB}], 2, 5 * GB, {}),  # plans limit their memory already
         ([{"CPU": 32.0, "GPU": 4.0}], 2, 5 * GB, {"GPU": 1}),  # Ray knows of no memory
     ],
 )
-def test_ranks_request_cores_gpus_and_memory_for_a_shared_scene(
+def test_ranks_request_cores_gpus_and_memory_for_their_scene(
     nodes: list[dict[str, float]], ranks: int, scene: int, resources: dict[str, float]
 ) -> None:
     assert _bundle(nodes, ranks, 8, scene) == {"CPU": 8, **resources}
@@ -212,16 +190,16 @@ def test_ray_grants_no_gpus_without_free_memory() -> None:
     """The cluster has two GPUs and 10 GB; a scene of 2 GB needs 10 GB with two ranks and 7 GB with one."""
     with Cluster(2):
         reserved = reserve(2, 2 * GB)
-        assert len(reserved.groups) == 2
+        assert reserved.ranks == 2
         reserved.release()
         with taken(3 * GB):
             fewer = reserve(2, 2 * GB)
-            assert (len(fewer.groups), fewer.gpus) == (1, 1)
+            assert (fewer.ranks, fewer.gpus) == (1, 1)
             fewer.release()
-        with taken(4 * GB), pytest.raises(NoCapacityError, match=r"needs a core, a GPU and 7\.0 GB of memory"):
+        with taken(4 * GB), pytest.raises(NoCapacityError, match="needs CPU 1, GPU 1, memory 7,000,000,000"):
             reserve(2, 2 * GB)
         again = reserve(2, 2 * GB)
-        assert len(again.groups) == 2, "what was waited for in vain is not asked for any more"
+        assert again.ranks == 2, "what was waited for in vain is not asked for any more"
         again.release()
 
 

@@ -6,7 +6,6 @@ import os
 import struct
 import subprocess
 import sys
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
@@ -29,11 +28,10 @@ from sgsst_core.loss.terms import LossTerms
 from sgsst_core.messages import decode, encode
 from sgsst_core.parallel.collectives import Collectives, ImageExchange, same_on_all
 from sgsst_core.planning.facts import Machine
-from sgsst_core.progress import Decision, Progress
+from sgsst_core.progress import Decision
 from sgsst_core.scene.camera import Camera, Lens
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests.api.service import wait_for
 from tests.networks import tiny_weights
 from tests.ports import free_port
 from tests.sgsst_core.synthetic_images import relative_error
@@ -41,9 +39,8 @@ from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
 from worker.capture import Capture
 from worker.outputs import Outputs
-from worker.ranks.driver import LONG_WAIT, RankGroup, RankHandle, long_wait
-from worker.ranks.process_group import WAITING, _backend, _meet, with_index
-from worker.ranks.rank import Outcome, RankStatus, _failure
+from worker.ranks.process_group import _backend, _meet
+from worker.ranks.rank import _failure
 
 HEIGHT = 70
 ROOT = Path(__file__).resolve().parents[3]
@@ -350,50 +347,6 @@ def test_invalid_bytes_are_refused(data: bytes) -> None:
         decode(torch.tensor(list(data), dtype=torch.uint8))
 
 
-def wait_for_first(collectives: Collectives, seen: Path) -> bool:
-    """Exchange a value once a thread of rank 1 has seen that it waits for rank 0; return whether it still does."""
-
-    def watch() -> None:
-        wait_for(lambda: WAITING.seconds > 0, "rank 1 to wait")
-        seen.touch()
-
-    if collectives.rank == 1:
-        threading.Thread(target=watch, daemon=True).start()
-    else:
-        wait_for(seen.exists, "rank 1 to wait")
-    collectives.all_gather(None)
-    return WAITING.seconds > 0
-
-
-def test_wait_for_another_rank_is_visible(tmp_path: Path) -> None:
-    assert on_ranks(2, wait_for_first, tmp_path / "seen") == [False, False]
-
-
-def rank_handle(waiting: float, stage: str | None = None, error: Exception | None = None) -> RankHandle:
-    outcome = None if error is None else Outcome(error=error)
-    status = RankStatus(waiting=waiting, progress=Progress(stage=stage) if stage else None, outcome=outcome)
-    return RankHandle(None, None, status=status)
-
-
-@pytest.mark.parametrize(
-    ("handles", "said"),
-    [
-        ([rank_handle(0.0), rank_handle(LONG_WAIT - 1)], None),
-        (
-            [rank_handle(LONG_WAIT + 1, "planning"), rank_handle(0.0), rank_handle(2.0, "planning")],
-            "Worker 0. Still at work: Worker 1 (reading), Worker 2 (planning).",
-        ),
-        (
-            [rank_handle(LONG_WAIT + 1), rank_handle(0.0, error=RuntimeError()), rank_handle(LONG_WAIT + 9)],
-            "Worker 0, Worker 2. All wait for each other's messages: check the network between their machines.",
-        ),
-    ],
-)
-def test_long_wait_names_the_late_ranks(handles: list[RankHandle], said: str | None) -> None:
-    line = long_wait(RankGroup(handles))
-    assert line == (said and f"Waiting for more than 60 s: {said}")
-
-
 @pytest.mark.slow
 def test_thread_count_can_be_set_after_kernels_ran() -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -402,13 +355,6 @@ def test_thread_count_can_be_set_after_kernels_ran() -> None:
     )
     assert ended.returncode == 0, ended.stderr
     assert int(ended.stdout) > 1
-
-
-def test_devices_get_an_index(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PyTorch refuses a device without one."""
-    monkeypatch.setattr(torch.cuda, "current_device", lambda: 3)
-    assert (with_index("cuda"), with_index("cuda:1")) == (torch.device("cuda", 3), torch.device("cuda", 1))
-    assert with_index("cpu") == torch.device("cpu")
 
 
 def test_store_error_is_an_echo_of_a_lost_rank() -> None:

@@ -99,7 +99,7 @@ def test_two_ranks_match_one_and_synchronize_once_per_step() -> None:
     """Communication is not counted as host synchronization, because the library waits for other ranks anyway."""
     pytest.importorskip("triton")
     expected, losses, _, _ = run_steps(ALONE)
-    first, second = on_ranks(2, run_steps, device="cuda")
+    first, second = on_ranks(2, run_steps, device="cuda:0")
     assert first[2][2:] == second[2][2:] == [1] * (STEPS - 2)
     assert torch.equal(first[0], second[0])
     assert first[1] == second[1]
