@@ -2,37 +2,27 @@
 
 The command line, the service's inspection process and every rank of a job use these readers, so that all of them
 interpret the files in the same way.
-
-The lowest rank of a machine reads the scene and copies its arrays to an anonymous memory file (memfd). The other ranks
-open that file through the /proc entry of the reader and map it copy-on-write: ranks share the pages, but cannot change
-each other's data. The system frees the memory when the last process that uses it ends, so it cannot leak. Where there
-are no such files (Windows, macOS), every rank reads the scene.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import mmap
-import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core import container
 from sgsst_core.errors import CameraError, ImageError, MaskError, SceneTooLargeError, SettingsError, SgsstError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.formats import read_scene_header
-from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.images import WHITE, Color, Photo, check_names, find_masks, image_size, load_image, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_property, read_scene
 from sgsst_core.orbit import Orbit
@@ -56,7 +46,7 @@ from sgsst_core.regions import (
     where_property,
 )
 from sgsst_core.scene.camera import Camera, fit_cameras
-from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
@@ -64,7 +54,6 @@ from sgsst_core.stylizing.job import check_style_size
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import REST, RegionRequest, Selection, StyleFile
-from worker.processes import home
 
 T = TypeVar("T")
 #: Maximum number of pixels of all images of a style: as float32 they take 400 MB, and up to as much again while one of
@@ -100,7 +89,6 @@ class Inputs:
         photos: Photo of each camera for the content term; None if it uses unstylized renders.
         decisions: Decisions about scene, cameras and photos for the plan.
         regions: Regions of the scene; None if the job has none.
-        reader: Whether this rank read the scene's file itself, as one rank of each machine does.
     """
 
     style: Style
@@ -110,7 +98,6 @@ class Inputs:
     photos: list[Photo] | None
     decisions: tuple[Decision, ...]
     regions: Regions | None
-    reader: bool
 
     def chosen(self, choice: TimeChoice, settings: Settings) -> Inputs:
         """Return the inputs with the views of a time budget, given the settings that it has chosen."""
@@ -154,7 +141,10 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
         axes, about_axes, about_color = collectives.broadcast(
             lambda: (*choose_axes(source, images), about_background(source.scene, settings.background))
         )
-        scene_file, reader = _read_scene(request, axes, collectives, limits)
+        if not limits:  # else it does not matter whether the memory of this machine suffices now
+            together(collectives, lambda: check_memory(source.scene, collectives, settings.growth))
+        read = partial(read_scene, source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+        scene_file = together(collectives, read).rendered(source.render_mode, source.eps2d)
     with errors_of("cameras"):
         check_choice(source)
         capture = _capture_on_all_ranks(request, scene_file, collectives).fitted(settings)
@@ -182,22 +172,7 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
     with errors_of("regions"):
         regions = read_regions(request, scene_file, capture.cameras, collectives)
     decisions = (*about_notes(scene_file), *about_axes, *about_rendering(scene_file), *about_color, *capture.decisions)
-    return Inputs(style, scene_file, capture.cameras, capture.orbit, capture.photos, decisions, regions, reader)
-
-
-def _read_scene(
-    request: JobSpec, axes: SpzAxes, collectives: Collectives, limits: InputLimits | None
-) -> tuple[SceneFile, bool]:
-    """Return the scene in the requested render mode, and whether this rank read its file."""
-    source, drop_invalid = request.source, request.source.drop_invalid
-    if limits:  # whether the memory of this machine suffices now does not matter
-        file, reader = read_scene(source.scene, drop_invalid=drop_invalid, spz_axes=axes), True
-    else:
-        growth = request.settings.growth
-        file, reader = read_shared_scene(
-            source.scene, collectives, drop_invalid=drop_invalid, growth=growth, spz_axes=axes
-        )
-    return file.rendered(source.render_mode, source.eps2d), reader
+    return Inputs(style, scene_file, capture.cameras, capture.orbit, capture.photos, decisions, regions)
 
 
 def _check_masks(regions: Sequence[RegionRequest], names: Sequence[str], limits: InputLimits) -> None:
@@ -242,7 +217,7 @@ def check_frames_have_sizes(path: Path) -> None:
 
 
 def fingerprint_of(inputs: Inputs, settings: Settings, weights: str, collectives: Collectives) -> str:
-    """Return the fingerprint of a job, after checking that all ranks that read the scene computed the same one.
+    """Return the fingerprint of a job, after checking that all ranks have computed the same one.
 
     Args:
         weights: Digest of the feature network's weights.
@@ -252,20 +227,15 @@ def fingerprint_of(inputs: Inputs, settings: Settings, weights: str, collectives
     """
     photos = inputs.photos
     stamps = collectives.broadcast(lambda: repr([_stamp(photo) for photo in photos]) if photos else "")
-    own = None
-    if inputs.reader:
-        own = fingerprint(
-            inputs.scene_file.scene, inputs.cameras, inputs.style, settings, weights, stamps, inputs.regions
-        )
+    own = fingerprint(inputs.scene_file.scene, inputs.cameras, inputs.style, settings, weights, stamps, inputs.regions)
     fingerprints = collectives.all_gather((own, socket.gethostname()))
     for other, host in fingerprints:
-        if other is not None and other != fingerprints[0][0]:
+        if other != fingerprints[0][0]:
             raise SettingsError(
                 f"The files of this job are not the same on {fingerprints[0][1]} and {host}: scene, cameras, style or "
                 "weights differ. Give paths on a file system that all machines share."
             )
-    assert fingerprints[0][0] is not None  # rank 0 always reads the scene itself
-    return fingerprints[0][0]
+    return own
 
 
 def read_regions(
@@ -531,117 +501,16 @@ def _load_mask(mask: Photo, camera: Camera) -> Tensor:
     return load_photo(mask, camera, color_managed=False).mean(dim=2)
 
 
-# --- scene that the ranks of a machine share --------------------------------------------------------------------------
-
 #: Bytes per Gaussian that a rank needs in addition to the scene and the optimizer: projection to a view (center, conic,
 #: depth, extent, sorting keys), color in the view, and gradients of the view's color and of the optimized color.
 VIEW_BYTES = 96
-#: Arrays start at multiples of this many bytes, so that every dtype is aligned.
-_ALIGNMENT = 64
-_Layout = dict[str, tuple[int, tuple[int, ...], str]]  # offset, shape and numpy dtype by name
 
 
-@dataclass(frozen=True)
-class _Shared:
-    """Location of a shared scene: the memory file of a process, and the layout of its arrays."""
-
-    process: int
-    descriptor: int
-    size: int
-    layout: _Layout
-    file: SceneFile  # with empty arrays
-
-
-def read_shared_scene(
-    path: Path,
-    collectives: Collectives,
-    *,
-    drop_invalid: bool = False,
-    growth: float = 1.0,
-    spz_axes: SpzAxes = "auto",
-) -> tuple[SceneFile, bool]:
-    """Read a scene once on each machine. Every rank must call this function.
-
-    Args:
-        drop_invalid: Whether to drop invalid Gaussians; see `read_scene`.
-        growth: Factor by which refinement may increase the number of Gaussians, and with it the memory requirement.
-
-    Returns:
-        The scene, and whether this rank read the file itself. Exactly one rank of each machine does.
-
-    Raises:
-        SceneError: If the scene cannot be read; see `read_scene`. Every rank raises the same error.
-        SceneTooLargeError: If the scene does not fit into the memory of a rank's machine or GPU.
-    """
-    homes = collectives.all_gather(home())
-    reader = homes.index(home())
-    sharing = homes.count(home())
-    together(collectives, lambda: _check_memory(path, collectives.rank, sharing, growth))
-    read = partial(read_scene, path, drop_invalid=drop_invalid, spz_axes=spz_axes)
-
-    def read_first() -> tuple[SceneFile | None, _Shared | None]:
-        """Read the scene if this rank does so for its machine, and share it with the others there."""
-        if collectives.rank != reader:
-            return None, None
-        file = read()
-        return _share(file) if sharing > 1 and hasattr(os, "memfd_create") else (file, None)
-
-    own, shared = together(collectives, read_first)
-    try:
-        offer = collectives.all_gather(shared)[reader]
-        if own is None and offer is not None:
-            with suppress(OSError):  # some systems hide even the user's own processes in /proc
-                own = _mapped(offer, f"/proc/{offer.process}/fd/{offer.descriptor}")
-        if own is None:
-            own = read()
-        collectives.all_gather(None)  # barrier: the reader closes its memory file after all ranks have opened it
-    finally:
-        if shared is not None:
-            os.close(shared.descriptor)
-    return own, collectives.rank == reader
-
-
-def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
-    """Copy a scene to a memory file; return the scene mapped from there, and its location."""
-    arrays: dict[str, NDArray[Any]] = {name: getattr(file.scene, name).numpy() for name in TENSORS}
-    if file.retained is not None:
-        arrays["retained"] = file.retained
-    layout: _Layout = {}
-    size = 0
-    for name, array in arrays.items():
-        layout[name] = (size, array.shape, array.dtype.str)
-        size += -(-array.nbytes // _ALIGNMENT) * _ALIGNMENT
-    descriptor = os.memfd_create("sgsst-scene", os.MFD_CLOEXEC)
-    os.ftruncate(descriptor, size)
-    with mmap.mmap(descriptor, size) as memory:
-        for name, (offset, _, _) in layout.items():
-            data = np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8)
-            memory[offset : offset + data.nbytes] = data.data
-    nothing: dict[str, Any] = dict.fromkeys(TENSORS, torch.empty(0))
-    empty = replace(file.scene, **nothing)
-    shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, retained=None))
-    return _mapped(shared, f"/proc/self/fd/{descriptor}"), shared
-
-
-def _mapped(shared: _Shared, path: str) -> SceneFile:
-    """Map the scene of a memory file."""
-    with Path(path).open("rb") as file:
-        memory = mmap.mmap(file.fileno(), shared.size, access=mmap.ACCESS_COPY)
-    arrays = {}
-    for name, (offset, shape, kind) in shared.layout.items():
-        count = int(np.prod(shape))
-        arrays[name] = np.frombuffer(memory, kind, count, offset).reshape(shape) if count else np.empty(shape, kind)
-    retained = arrays.pop("retained", None)
-    tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    return replace(shared.file, scene=replace(shared.file.scene, **tensors), retained=retained)
-
-
-def _check_memory(path: Path, rank: int, sharing: int, growth: float) -> None:
+def check_memory(path: Path, collectives: Collectives, growth: float = 1.0) -> None:
     """Check that a scene, by the size in its header, fits into the free memory of this rank's machine and GPU.
 
     Args:
-        sharing: Number of ranks on this machine.
-        growth: Factor of growth; see `read_shared_scene`.
+        growth: Factor by which refinement may increase the number of Gaussians.
 
     Raises:
         SceneError: If the header cannot be read.
@@ -651,14 +520,14 @@ def _check_memory(path: Path, rank: int, sharing: int, growth: float) -> None:
     count = int(header.count * growth)
     scene_bytes = int(header.count * 4 * (14 + 3 * header.coefficients) * growth)
     own = count * (OPTIMIZER_BYTES + VIEW_BYTES)
-    each = scene_bytes + own  # every rank has its own copy of the Gaussians that its views show
-    where = f"Rank {rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
+    where = f"Rank {collectives.rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
     advice = "Give a machine with more memory, fewer --workers on each, or a smaller scene."
-    needed, free = scene_bytes + sharing * each, container.memory().available
+    # Every rank has the scene, and a copy of the Gaussians that its views show.
+    needed, free = collectives.local_size * (2 * scene_bytes + own), container.memory().available
     if needed > free:
-        ranks = f"{sharing} ranks share it" if sharing > 1 else "there is one rank"
         raise SceneTooLargeError(
-            f"{where} {needed / 1e9:.2f} GB of memory ({ranks}), but {free / 1e9:.2f} GB are free. {advice}"
+            f"{where} {needed / 1e9:.2f} GB of memory (ranks there: {collectives.local_size}), but {free / 1e9:.2f} GB "
+            f"are free. {advice}"
         )
     if torch.cuda.is_available():
         free, total = torch.cuda.mem_get_info()

@@ -1,17 +1,12 @@
-"""Tests of selecting the Gaussians of regions, and of reading a scene once per machine."""
+"""Tests of selecting the Gaussians of regions, and of the memory that a scene needs."""
 
-import gc
-import hashlib
 import os
-import socket
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-import psutil
 import pytest
 import torch
 from PIL import Image
@@ -25,13 +20,12 @@ from sgsst_core.files.images import save_png
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.files.formats.samples import rewritten
 from tests.small_scenes import cameras, wall, write_files
 from tests.worker.ranks.spawn import on_ranks
-from worker.inputs import cropped, load_styles, read_shared_scene, select, select_regions
+from worker.inputs import check_memory, cropped, load_styles, select, select_regions, together
 from worker.options import RegionRequest, parse_selection
-from worker.processes import home
 
 
 def region(name: str, spec: str, **values: Any) -> RegionRequest:
@@ -140,73 +134,6 @@ def test_invalid_mask_folders_are_refused(tmp_path: Path, file: SceneFile) -> No
         labels_of(file, region("a", f"masks={empty}"))
 
 
-linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory files are looked for in Linux's /proc")
-
-
-def digest(scene: Scene) -> str:
-    """Return a hash of all tensors of a scene."""
-    return hashlib.sha256(b"".join(getattr(scene, name).numpy().tobytes() for name in TENSORS)).hexdigest()
-
-
-def shared(collectives: Collectives, path: Path, drop: bool) -> tuple[str, bool, int, int, int]:
-    """Share a scene file among ranks, and return what this rank sees.
-
-    Returns:
-        Digest of the scene, whether this rank has read the file, and the numbers of dropped rows, mappings, and leaked
-        shared memory files.
-    """
-    file, reader = read_shared_scene(path, collectives, drop_invalid=drop)
-    maps = Path("/proc/self/maps").read_text().count("memfd:sgsst-scene")
-    file.scene.sh_dc[0] += 1.0  # must not be visible to other ranks
-    collectives.all_gather(None)
-    again = read_scene(path, drop_invalid=drop).scene.sh_dc
-    assert float((file.scene.sh_dc - again).abs().sum()) == pytest.approx(3.0)
-    file.scene.sh_dc[0] = again[0]
-    digests, dropped = digest(file.scene), file.dropped
-    del file
-    gc.collect()
-    left = sum(
-        "memfd:sgsst-scene" in os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()
-    )
-    return digests, reader, dropped, maps, left
-
-
-@linux
-@pytest.mark.parametrize("drop", [False, True])
-def test_one_rank_reads_and_shares_the_scene(tmp_path: Path, drop: bool) -> None:
-    scene = wall(sh_degree=1)
-    if drop:
-        scene.opacities[7] = float("nan")
-    write_scene(tmp_path / "scene.ply", scene)
-    results = on_ranks(3, shared, tmp_path / "scene.ply", drop)
-    alone = digest(read_scene(tmp_path / "scene.ply", drop_invalid=drop).scene)
-    assert ([rank[0] for rank in results], [rank[1] for rank in results]) == ([alone] * 3, [True, False, False])
-    assert [rank[2] for rank in results] == [int(drop)] * 3
-    assert all(rank[3] >= 1 for rank in results), "not mapped"
-    assert [rank[4] for rank in results] == [0, 0, 0], "left behind"
-
-
-def read_as_on_macos(collectives: Collectives, path: Path) -> tuple[str, bool, tuple[str, ...]]:
-    """Return the digest of a scene, whether this rank has read its file, and its home, as a system without memfd."""
-    memory_file = os.memfd_create
-    try:
-        del os.memfd_create
-        with patch.object(sys, "platform", "darwin"):
-            file, reader = read_shared_scene(path, collectives)
-            return digest(file.scene), reader, home()
-    finally:
-        os.memfd_create = memory_file
-
-
-@linux
-def test_every_rank_reads_the_scene_where_memory_files_are_missing(tmp_path: Path) -> None:
-    write_scene(tmp_path / "scene.ply", wall(sh_degree=1))
-    results = on_ranks(2, read_as_on_macos, tmp_path / "scene.ply")
-    assert [rank[0] for rank in results] == [digest(read_scene(tmp_path / "scene.ply").scene)] * 2
-    assert [rank[1] for rank in results] == [True, False]
-    assert [rank[2] for rank in results] == [(socket.gethostname(), psutil.Process().username())] * 2
-
-
 def test_compressed_scene_needs_memory_of_its_floats(tmp_path: Path) -> None:
     """The requirement follows from the header, before the scene is decompressed."""
     path = tmp_path / "scene"
@@ -214,13 +141,13 @@ def test_compressed_scene_needs_memory_of_its_floats(tmp_path: Path) -> None:
         write_scene(path, wall(sh_degree=3), format)
         little = patch.object(container, "memory", return_value=container.Memory(1 << 40, 616 * 4 * 59))
         with little, pytest.raises(SceneTooLargeError, match="616 Gaussians need"):
-            read_shared_scene(path, ALONE)
+            check_memory(path, ALONE)
 
 
-def refused(collectives: Collectives, path: Path) -> str:
-    """Return the error message of a rank that refuses the scene."""
+def read_by_second_rank(collectives: Collectives, path: Path) -> str:
+    """Read a scene on rank 1 alone, and return the error message of this rank."""
     with pytest.raises(SceneError) as caught:
-        read_shared_scene(path, collectives)
+        together(collectives, lambda: read_scene(path) if collectives.rank else None)
     return str(caught.value)
 
 
@@ -228,7 +155,7 @@ def test_invalid_scene_is_refused_on_every_rank(tmp_path: Path) -> None:
     scene = wall()
     scene.scales[3, 1] = float("nan")
     write_scene(tmp_path / "scene.ply", scene)
-    messages = on_ranks(2, refused, tmp_path / "scene.ply")
+    messages = on_ranks(2, read_by_second_rank, tmp_path / "scene.ply")
     assert messages[0] == messages[1]
     assert "scale_1" in messages[0]
 
@@ -246,4 +173,4 @@ def test_scene_beyond_memory_is_refused_with_figures(tmp_path: Path) -> None:
     except OSError as error:
         pytest.skip(f"no file of this size here: {error}")
     with pytest.raises(SceneTooLargeError, match=r"1,000,000,000 Gaussians need \d+\.\d+ GB .* are free"):
-        read_shared_scene(path, ALONE)
+        check_memory(path, ALONE)

@@ -7,12 +7,14 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Literal
 
+import psutil
 import pytest
 
 from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedError, SceneError
 from sgsst_core.progress import Progress
 from worker.job import memory_beside_gpus, scene_bytes
 from worker.prepare import Prepared
+from worker.processes import home
 from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, reserve
 from worker.ranks.driver import MOST_ATTEMPTS, AttemptFailedError, Relay, check_retry, failure_of
 from worker.ranks.rank import RankStatus
@@ -141,6 +143,11 @@ def test_warnings_are_relayed_once_per_attempt(again: bool) -> None:
         assert len(recorder.after(status)) == 2
     else:
         assert recorder.after(status) == [("warning", "b")]
+
+
+def test_home_without_proc_names_host_and_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert home() == (socket.gethostname(), psutil.Process().username())
 
 
 GB = 1_000_000_000
