@@ -56,9 +56,8 @@ from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
 from worker.capture import Capture, about_notes, about_rendering, choose_axes, orbit_request, read_capture
 from worker.inputs import check_something_in_view, cropped, read_job_capture, read_requested
-from worker.job import JobSpec, SceneRequest, check_choice
+from worker.job import JobSpec, SceneRequest, check_choice, check_folder, check_is_not_input, result_format
 from worker.options import DEFAULT_SIDE, MOST_VIEWPOINT_NAME, VideoOptions, Viewpoint, Viewpoints
-from worker.outputs import check_folder, check_is_not_input, result_format
 from worker.prepare import describe_scene
 
 #: Number of views of an orbit that a converted scene is compared in.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import operator
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,7 +37,6 @@ from sgsst_core.settings import (
     default_text,
     make_settings,
     parse_color,
-    parse_strength,
     preset_texts,
 )
 
@@ -241,11 +241,6 @@ class StyleFile:
 
     path: Path
     weight: float = 1.0
-
-    @property
-    def text(self) -> str:
-        """Return the text that `parse_style` parses to this file."""
-        return str(self.path) if self.weight == 1 else f"{self.path}:{self.weight!r}"
 
 
 def path_or_url(value: str | Path) -> Path | str:
@@ -523,7 +518,7 @@ def region_options(
     Raises:
         SettingsError: If a text is malformed, a name is used twice, or a region is unknown.
     """
-    by_name: dict[str, RegionOptions] = {}
+    by_name: dict[str, dict[str, Any]] = {}
     for text in regions:
         name, separator, spec = text.partition(":")
         name = name.strip()
@@ -531,45 +526,27 @@ def region_options(
             raise SettingsError(f"--region {text}: expected NAME:SPEC, such as face:sphere=0,1.4,0,0.3. {_HOW}")
         if name in by_name:
             raise SettingsError(f"--region {text}: a region {name} already exists. Give each region a unique name.")
-        by_name[name] = checked(RegionOptions, {"name": name, "select": spec})
-    given = set(by_name)
-
-    def known(name: str, option: str) -> RegionOptions:
-        if name != REST and name not in given:
-            names = ", ".join([*by_name, REST]) if REST not in by_name else ", ".join(by_name)
-            raise SettingsError(f"{option}: there is no region {name!r}. Use one of {names}, or add it with --region.")
-        return by_name.get(name, RegionOptions(name=REST))
-
-    for text in styles:
-        name, _, file = text.partition("=")
-        region = known(name, f"--region-style {text}")
-        if not file:
-            raise SettingsError(f"--region-style {text}: expected NAME=FILE. Give the path of a style image.")
-        by_name[name] = region.model_copy(update={"style": [*region.style_texts, file]})
-    for text in weights:
+        by_name[name] = {"name": name, "select": spec}
+    known, files = dict.fromkeys([*by_name, REST]), defaultdict[str, list[str]](list)
+    fields = {"style": styles, "weight": weights, "content_weight": content_weights, "freeze": frozen}
+    for field_name, text in ((field_name, text) for field_name, texts in fields.items() for text in texts):
+        option = f"--region-{field_name.replace('_', '-')} {text}"
         name, _, value = text.partition("=")
-        region = known(name, f"--region-weight {text}")
-        weight = _number(value, text, "--region-weight")
-        if not 0 < weight <= MOST_REGION_WEIGHT:
-            raise SettingsError(f"--region-weight {text}: the weight must be greater than 0 and at most 1,000,000.")
-        by_name[name] = region.model_copy(update={"weight": weight})
-    for text in content_weights:
-        name, _, value = text.partition("=")
-        region = known(name, f"--region-content-weight {text}")
-        by_name[name] = region.model_copy(update={"content_weight": _content_weight(value, text)})
-    for name in frozen:
-        by_name[name] = known(name, f"--region-freeze {name}").model_copy(update={"freeze": True})
-    return tuple(by_name.values())
-
-
-def _content_weight(value: str, text: str) -> float:
-    try:
-        weight = parse_strength(value)
-    except ValueError as error:
-        raise SettingsError(f"--region-content-weight {text}: {error}") from error
-    if not 0 <= weight <= 1e12:
-        raise SettingsError(f"--region-content-weight {text}: the weight must be at least 0 and at most 1e12.")
-    return weight
+        if name not in known:
+            raise SettingsError(
+                f"{option}: there is no region {name!r}. Use one of {', '.join(known)}, or add it with --region."
+            )
+        if not value and field_name != "freeze":
+            raise SettingsError(f"{option}: expected NAME=VALUE. Give the value after the region's name.")
+        values = by_name.setdefault(name, {"name": name})
+        if field_name == "style":
+            files[name].append(value)
+        else:
+            values[field_name] = value or True
+    return tuple(
+        checked(RegionOptions, values).model_copy(update={"style": files[name] or None})
+        for name, values in by_name.items()
+    )
 
 
 def region_requests(
@@ -597,11 +574,10 @@ def region_requests(
             raise SettingsError(
                 f"Region {region.name!r} is frozen, so it cannot have a style or weight. Remove one or the other."
             )
-    selecting = len([name for name in names if name != REST])
-    if selecting > MOST_REGIONS:
+    rest = [region for region in requests if region.name == REST]
+    if (selecting := len(requests) - len(rest)) > MOST_REGIONS:
         raise SettingsError(f"There are {selecting} regions. At most {MOST_REGIONS} are allowed.")
-    rest = next((region for region in requests if region.name == REST), None)
-    return (*([rest] if rest else []), *(region for region in requests if region.name != REST))
+    return (*rest, *(region for region in requests if region.name != REST))
 
 
 #: Maximum numbers of named viewpoints, and of characters of a name.

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
@@ -37,10 +36,9 @@ from worker.inputs import (
     read_requested,
     read_scene_and_capture,
 )
-from worker.job import JobSpec, Result, SceneRequest, check_choice
+from worker.job import JobSpec, Outputs, Result, SceneRequest, check_choice, check_request, check_suffix
 from worker.options import CameraParameters, PaintedFile, PaintedOptions
-from worker.outputs import Outputs, check_file, check_is_not_input, check_suffix, result_format
-from worker.prepare import Prepared, describe_scene, save_thumbnail
+from worker.prepare import THUMBNAIL_SIDE, Prepared, describe_scene, save_thumbnail
 
 if TYPE_CHECKING:
     from worker.ranks.rank import WorkerOptions
@@ -50,11 +48,6 @@ if TYPE_CHECKING:
 _CHUNK = "sgsst-view"
 #: Number of other views that tell how well the painted ones show a Gaussian.
 _OTHERS = 12
-#: An image that states no view is compared with so many, at this longer side. It is refused if another one than it is
-#: said to show fits better by so many dB. An image less opaque than this on average shows paint, not the view.
-_MOST_COMPARED, _COMPARED_SIDE, _CLEARLY, _OPAQUE = 100, 160, 3.0, 0.5
-#: Longer side of the thumbnail in pixels.
-_THUMBNAIL_SIDE = 480
 #: Predicted seconds on one core: of a pass for each Gaussian and pixel of a view, and of everything else for each
 #: Gaussian. Measured with 48,000 and a million Gaussians at 480 pixels.
 _SECONDS_PER_GAUSSIAN, _SECONDS_PER_PIXEL, _OTHER_SECONDS = 1.5e-7, 3.5e-7, 1.2e-5
@@ -133,7 +126,7 @@ def read_paintings(request: JobSpec, limits: InputLimits | None = None) -> Paint
     Raises:
         InvalidInputError: If an input cannot be used. Its attribute `role` is the input's role.
     """
-    source, background = request.source, request.settings.background
+    source = request.source
     with errors_of("scene"):
         if limits:
             limits.check_count(read_scene_header(source.scene).count, 1.0)
@@ -145,16 +138,13 @@ def read_paintings(request: JobSpec, limits: InputLimits | None = None) -> Paint
         capture = read_capture(source, file.scene).checked(file.scene, source.near)
         if limits:
             limits.check_cameras(capture.cameras)
-    rasterizer = make_rasterizer("cpu", file.scene, background=background, near=source.near)
     with errors_of("painted"):
         cameras = [_camera_of(painted, capture.cameras, limits) for painted in request.paintings]
         _check_together(request.paintings, cameras)
         views = []
         for painted, camera in zip(request.paintings, cameras, strict=True):
             check_something_in_view(file.scene, [camera], source.near)
-            views.append(view := load_painting(painted.path, camera))
-            if _stated(painted.path) is None and painted.options.camera is None and float(view.alpha.mean()) >= _OPAQUE:
-                _check_view(painted.path, view, capture.cameras, lambda camera: _render(rasterizer, file, camera))
+            views.append(load_painting(painted.path, camera))
     names = ", ".join(f"{camera.name} ({camera.width}x{camera.height})" for camera in cameras)
     about = Decision("painted views", names, "the scene follows them; geometry and view-dependent colors stay")
     return PaintInputs(file, capture, views, (*decisions, *capture.decisions, about))
@@ -247,34 +237,6 @@ def _stated(path: Path) -> PaintedOptions | None:
         return None
 
 
-def _check_view(
-    path: Path, painted: PaintedView, cameras: Sequence[Camera], render: Callable[[Camera], Tensor]
-) -> None:
-    """Check that an image that states no view shows the one that it is said to.
-
-    Raises:
-        ImageError: If another view fits it clearly better.
-    """
-    painting = torch.cat([painted.image, painted.alpha[:, :, None]], dim=2).permute(2, 0, 1)[None]
-
-    def fit(other: Camera) -> float:
-        """Return the PSNR of a view with the image's colors, by the affine map that fits best."""
-        small = resized(other, _COMPARED_SIDE)
-        pixels = torch.nn.functional.interpolate(painting, (small.height, small.width), mode="area")
-        colors, weight = pixels[0, :3].flatten(1).T.double(), pixels[0, 3].flatten().double()[:, None]
-        terms = render(small).flatten(0, 1).double()
-        terms = torch.cat([terms, torch.ones_like(terms[:, :1])], dim=1)
-        ridge = 1e-6 * float(weight.sum()) * torch.eye(4, dtype=torch.float64)
-        map = torch.linalg.solve((terms * weight).T @ terms + ridge, (terms * weight).T @ colors)
-        error = ((terms @ map - colors).square() * weight).sum() / (3 * weight.sum())
-        return float(-10 * torch.log10(error.clamp_min(1e-12)))
-
-    best = max(spread(cameras, _MOST_COMPARED), key=fit)
-    if fit(best) > fit(painted.camera) + _CLEARLY:
-        name = painted.camera.name
-        raise ImageError(f"{path}: does not look like the view {name}, but like {best.name}. Name that view.")
-
-
 class _InterruptedError(Exception):
     """Interruption of a job on request."""
 
@@ -288,18 +250,16 @@ def run_painting(request: JobSpec, listener: Listener, options: WorkerOptions) -
         SgsstError: If the job fails; nothing is written then.
     """
     started = time.perf_counter()
-    _check_outputs(request)
+    check_request(request)
     inputs = read_paintings(request)
     file, now = inputs.scene_file, Progress(stage="painting", total=PASSES)
     lines = [(line.item, f"{line.decision}: {line.reason}") for line in inputs.decisions]
     listener.prepared(Prepared([("scene", describe_scene(file)), *lines], 0, PASSES))
-    first: tuple[int, float] | None = None  # what comes before the passes says nothing about their pace
+    begun = time.perf_counter()
 
     def show(done: int) -> None:
-        nonlocal now, first
-        begun, since = first = first or (done, time.perf_counter())
-        pace = (time.perf_counter() - since) / (done - begun) if done > begun else inputs.seconds / PASSES
-        left = pace * (PASSES - done)
+        nonlocal now
+        left = (time.perf_counter() - begun) / done * (PASSES - done) if done else inputs.seconds
         now = Progress(stage="painting", step=done, total=PASSES, eta_s=left)
         listener.progress(now)
         if listener.stop():
@@ -314,29 +274,12 @@ def run_painting(request: JobSpec, listener: Listener, options: WorkerOptions) -
         return Result(stopped="interrupted", steps=now.step, total=PASSES)
     if options.preview_folder:
         camera = inputs.cameras[0]
-        camera = resized(camera, min(camera.side, _THUMBNAIL_SIDE))
+        camera = resized(camera, min(camera.side, THUMBNAIL_SIDE))
         after = replace(file, scene=replace(file.scene, sh_dc=painted.sh_dc))
         save_thumbnail(options.preview_folder, *(_render(rasterizer, each, camera) for each in (file, after)))
     _write(request, inputs, painted, time.perf_counter() - started)
     before, after_ = painted.psnr_before, painted.psnr_after
     return Result(stopped="finished", steps=PASSES, total=PASSES, psnr_before=before, psnr_after=after_)
-
-
-def _check_outputs(request: JobSpec) -> None:
-    """Check that the outputs can be written, and are none of the inputs.
-
-    Raises:
-        OutputError: If one cannot be written.
-    """
-    result_format(request.out)
-    check_file(request.out)
-    inputs = {request.source.scene: "scene itself"} | {file.path: "painted image" for file in request.paintings}
-    if request.source.cameras is not None:
-        inputs[request.source.cameras] = "camera file"
-    outputs = Outputs.of(request.out)
-    for path, description in inputs.items():
-        for out in (request.out, outputs.report, outputs.plan, outputs.colors):
-            check_is_not_input(out, path, description)
 
 
 def _write(request: JobSpec, inputs: PaintInputs, painted: Painted, seconds: float) -> None:

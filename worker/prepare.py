@@ -42,8 +42,7 @@ from sgsst_core.stylizing.planner import choose_within, plan_job
 from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer, render_first_view, transferred_colors
 from worker.inputs import Inputs, fingerprint_of, read_inputs, same_weights, together
-from worker.job import JobSpec, Resume
-from worker.outputs import Outputs, check_request
+from worker.job import JobSpec, Outputs, Resume, check_request
 
 Warn = Callable[[str], None]
 
@@ -352,7 +351,7 @@ _FIRST_SECONDS, _FIRST_SHARE = 2.0, 0.1
 #: Maximum length of a preview's longer side in pixels.
 _SIDE = 960
 #: Maximum length of the thumbnail's longer side in pixels.
-_THUMBNAIL_SIDE = 480
+THUMBNAIL_SIDE = 480
 #: Name of the thumbnail. Clients show the last preview by name.
 _THUMBNAIL = "thumbnail.jpg"
 #: Minimum time between two writes of the colors, in seconds and as a fraction of the elapsed time.
@@ -408,8 +407,8 @@ class Previews:
     def finish(self, stylizer: Stylizer) -> None:
         """Write the thumbnail of a finished job: a view whose left half is unstylized. It replaces the previews."""
         with _warning(self._warn, "The thumbnail could not be rendered"):
-            before = _rendered(stylizer, stylizer.job.views.scene.sh_dc.to(stylizer.sh_dc.device), _THUMBNAIL_SIDE)
-            after = _rendered(stylizer, stylizer.shown(), _THUMBNAIL_SIDE)
+            before = _rendered(stylizer, stylizer.job.views.scene.sh_dc.to(stylizer.sh_dc.device), THUMBNAIL_SIDE)
+            after = _rendered(stylizer, stylizer.shown(), THUMBNAIL_SIDE)
             save_thumbnail(self._folder, before, after)
 
     def _write(self, step: int, render: Callable[[], Tensor | None]) -> None:

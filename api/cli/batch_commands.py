@@ -23,9 +23,8 @@ from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_o
 from sgsst_core.files.atomic import file_digest, write_json
 from sgsst_core.files.formats import SUFFIXES, scene_path
 from sgsst_core.settings import declared
-from worker.job import JobSpec
+from worker.job import JobSpec, Outputs, check_is_not_input
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
-from worker.outputs import Outputs, check_is_not_input
 from worker.ranks.rank import WorkerOptions
 
 if TYPE_CHECKING:

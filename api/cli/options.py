@@ -22,7 +22,7 @@ from service.inputs import JobParameters
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import SUFFIXES, scene_path
 from sgsst_core.settings import BY_PRESET, Declared, declared, merged, reason
-from worker.job import JobSpec, SceneRequest, default_cameras
+from worker.job import JobSpec, SceneRequest, check_file, check_folder, default_cameras
 from worker.options import (
     ESSENTIALS,
     GROUPS,
@@ -39,7 +39,6 @@ from worker.options import (
     region_options,
     region_requests,
 )
-from worker.outputs import check_file, check_folder
 
 Command = Callable[..., None]
 M = TypeVar("M", bound=BaseModel)

@@ -37,7 +37,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
 from sgsst_core.progress import clock, duration
 from sgsst_core.stylizing.progress_bar import job_bar, live_bar
-from worker.job import JobSpec, SceneRequest
+from worker.job import JobSpec, Outputs, SceneRequest, check_suffix
 from worker.options import (
     ESSENTIALS,
     MOST_VIEWPOINTS,
@@ -47,7 +47,6 @@ from worker.options import (
     ViewOptions,
     Viewpoints,
 )
-from worker.outputs import Outputs, check_suffix
 
 if TYPE_CHECKING:
     from api.cli.scene_tools import VariantsRequest

@@ -37,9 +37,8 @@ from sgsst_core.style import STARRY_NIGHT
 from worker.capture import orbit_request
 from worker.derived import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
-from worker.job import JobSpec, SceneRequest, check_choice
+from worker.job import JobSpec, SceneRequest, check_choice, check_is_not_input, check_suffix
 from worker.options import ViewOptions, split_weight
-from worker.outputs import check_is_not_input, check_suffix
 from worker.painting import camera_named
 from worker.prepare import dry_run
 

@@ -31,9 +31,8 @@ from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
 from sgsst_core.progress import clock
 from sgsst_core.stylizing.progress_bar import job_bar
-from worker.job import JobSpec, Result
+from worker.job import JobSpec, Outputs, Result, check_request
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
-from worker.outputs import Outputs, check_request
 from worker.processes import STOP_SIGNALS
 from worker.ranks.rank import WorkerOptions
 
