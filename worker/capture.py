@@ -15,13 +15,10 @@ from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.images import (
     MAX_MISSING,
-    WHITE,
-    Color,
     Photo,
     PhotoFolder,
     check_photos,
     photo_name,
-    photo_size,
     some_names,
 )
 from sgsst_core.files.scene_file import SceneFile, read_scene
@@ -47,7 +44,6 @@ class Capture:
         cameras: Cameras at the requested resolution.
         orbit: Orbit that generated the cameras; None if they come from a file.
         names: Names of the photos of all requested cameras, including those of views that are left out.
-        photo_sizes: Width and height of each camera's photo in the camera file.
         photos: Photo of each camera; None if the job uses unstylized renders.
         decisions: Decisions about cameras and photos for the plan.
     """
@@ -55,7 +51,6 @@ class Capture:
     cameras: list[Camera]
     orbit: Orbit | None
     names: tuple[str, ...]
-    photo_sizes: list[tuple[int, int]]
     photos: list[Photo] | None = None
     decisions: tuple[Decision, ...] = ()
 
@@ -82,17 +77,16 @@ class Capture:
         used = [index for index, photo in enumerate(matches) if photo is not None]
         photos = [photo for photo in matches if photo is not None]
         cameras = [undistorted(self.cameras[index]) for index in used]
-        sizes = [self.photo_sizes[index] for index in used]
         width = min((new.width / self.cameras[i].width for new, i in zip(cameras, used, strict=True)), default=1.0)
         size = f"at least {width:.0%} of their width, as much as their photos fill" if width < 1 else "their size"
         lines = _about_lenses(cameras, "the photos are undistorted", f"views keep {size}")
-        lines += _about_photos(cameras, sizes, photos, missing)
+        lines += _about_photos(cameras, photos, missing)
         if strangers := PhotoFolder(folder).strangers(self.names):
             reason = f"they have the name of no camera: {some_names(strangers)}"
             mostly = len(strangers) > MAX_MISSING * (len(strangers) + len(photos))
             text = f"{'warning: ' if mostly else ''}{len(strangers)} files are not used"
             lines.append(Decision("photos", text, reason))
-        return Capture(cameras, self.orbit, self.names, sizes, photos, (*self.decisions, *lines))
+        return replace(self, cameras=cameras, photos=photos, decisions=(*self.decisions, *lines))
 
     def checked(self, scene: Scene, near: float) -> Capture:
         """Return the capture with warnings if it does not fit a scene, and with its photos in the right orientation.
@@ -135,13 +129,12 @@ def read_capture(
     panoramas = len({camera.panorama for camera in cameras} - {None})
     if source.views is not None:
         cameras = spread(cameras, source.views)
-    sizes = [photo_size(camera) for camera in cameras]
     if source.resolution is not None:
         cameras = [resized(camera, source.resolution) for camera in cameras]
     if panoramas:
         reason = "views are pinholes: one for each face of a cube, with the panorama's pixels per degree in its middle"
         decisions.append(Decision("cameras", f"{panoramas} of {len(names)} are panoramas, six views each", reason))
-    return Capture(cameras, orbit, names, sizes, decisions=tuple(decisions))
+    return Capture(cameras, orbit, names, decisions=tuple(decisions))
 
 
 def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAxes, list[Decision]]:
@@ -205,23 +198,6 @@ def about_notes(file: SceneFile) -> list[Decision]:
     return [Decision("scene", "warning", note) for note in file.notes]
 
 
-def about_background(scene: Path, background: Color) -> list[Decision]:
-    """Return a warning if the original 3DGS code trained a scene on white, but the job's background is not white.
-
-    Args:
-        scene: File of the scene, RUN/point_cloud/iteration_N/point_cloud.ply.
-    """
-    arguments = scene.absolute().parent.parent.parent / "cfg_args"
-    try:
-        text = arguments.read_text(encoding="utf-8") if scene.name == "point_cloud.ply" else ""
-    except (OSError, ValueError):
-        return []
-    if background == WHITE or "white_background=True" not in text:
-        return []
-    reason = f"{arguments} has white_background=True; add --background white"
-    return [Decision("background", "warning: the scene was trained on white, which is not that of the job", reason)]
-
-
 def orbit_request(source: SceneRequest) -> OrbitRequest:
     """Convert the orbit options of a request."""
     up = None
@@ -240,21 +216,12 @@ def _about_lenses(cameras: Sequence[Camera], decision: str, reason: str) -> list
     return [Decision("lenses", decision, f"{about}; {reason}")] if models else []
 
 
-def _about_photos(
-    cameras: Sequence[Camera], sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], missing: Sequence[str]
-) -> list[Decision]:
-    """Return the decisions about missing, resized and rotated photos."""
+def _about_photos(cameras: Sequence[Camera], photos: Sequence[Photo], missing: Sequence[str]) -> list[Decision]:
+    """Return the decisions about missing, ambiguous and rotated photos."""
     lines = []
     if missing:
         left_out = f"warning: {len(missing)} of {len(missing) + len(photos)} views are left out"
         lines.append(Decision("photos", left_out, f"they have no photo: {some_names(missing)}"))
-    other = [(photo, size) for photo, size in zip(photos, sizes, strict=True) if photo.size != size]
-    if other:
-        photo, size = other[0]
-        shapes = f"{photo.size[0]}x{photo.size[1]} instead of {size[0]}x{size[1]}"
-        lines.append(
-            Decision("photos", f"{len(other)} are resized to their views", f"they have other sizes, such as {shapes}")
-        )
     single = [photo.path for camera, photo in zip(cameras, photos, strict=True) if camera.panorama is None]
     shared = [path.name for path, count in Counter(single).items() if count > 1]
     if shared:

@@ -29,7 +29,7 @@ from sgsst_core.orbit import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.facts import check_scales
 from sgsst_core.planning.plan import OPTIMIZER_BYTES
-from sgsst_core.planning.survey import nothing_seen, sees_something
+from sgsst_core.planning.survey import nothing_seen, sees_something, shown_by
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
@@ -51,7 +51,7 @@ from sgsst_core.settings import Settings
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.job import check_style_size
-from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
+from worker.capture import Capture, about_notes, about_rendering, choose_axes, read_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import REST, RegionRequest, Selection, StyleFile
 
@@ -59,8 +59,6 @@ T = TypeVar("T")
 #: Maximum number of pixels of all images of a style: as float32 they take 400 MB, and up to as much again while one of
 #: them is resized to the views.
 STYLE_PIXELS = 1 << 25
-#: Number of Gaussians that are projected at once to find one in a view.
-_BLOCK = 1 << 16
 _REDUCED = "{}: was reduced when it was read, because the style has more than 33 megapixels"
 
 
@@ -138,9 +136,7 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
                 limits.check_image(file.path)
         style = together(collectives, lambda: load_styles(request.styles, request.style_background))
     with errors_of("scene"):
-        axes, about_axes, about_color = collectives.broadcast(
-            lambda: (*choose_axes(source, images), about_background(source.scene, settings.background))
-        )
+        axes, about_axes = collectives.broadcast(lambda: choose_axes(source, images))
         if not limits:  # else it does not matter whether the memory of this machine suffices now
             together(collectives, lambda: check_memory(source.scene, collectives, settings.growth))
         read = partial(read_scene, source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
@@ -171,7 +167,7 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
             _check_masks(request.regions, capture.names, limits)
     with errors_of("regions"):
         regions = read_regions(request, scene_file, capture.cameras, collectives)
-    decisions = (*about_notes(scene_file), *about_axes, *about_rendering(scene_file), *about_color, *capture.decisions)
+    decisions = (*about_notes(scene_file), *about_axes, *about_rendering(scene_file), *capture.decisions)
     return Inputs(style, scene_file, capture.cameras, capture.orbit, capture.photos, decisions, regions)
 
 
@@ -247,8 +243,6 @@ def read_regions(
         InvalidInputError: If a selection or a style cannot be used, or if every Gaussian is frozen. Every rank raises
             the same error.
     """
-    if not request.regions:
-        return None
     settings, near = request.settings, request.source.near
 
     def load(files: Sequence[StyleFile]) -> Style:
@@ -339,21 +333,13 @@ def check_something_seen(scene: Scene, cameras: Sequence[Camera], rasterizer: Ra
 def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float) -> None:
     """Check that at least one camera sees a Gaussian, if possible without rendering.
 
-    A Gaussian whose center projects into a view counts as seen. Views are rendered only if there is no such Gaussian.
+    Views are rendered only if the centers of Gaussians are in no view; see `shown_by`.
 
     Raises:
         CameraError: If no camera sees a Gaussian.
     """
-    for block in scene.means.split(_BLOCK):  # the first block usually decides
-        means = block.double()
-        for camera in cameras:
-            x, y, z = (means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
-            across = camera.fx * x / z + camera.cx
-            down = camera.fy * y / z + camera.cy
-            inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
-            if bool(inside.any()):
-                return
-    check_something_seen(scene, cameras, make_rasterizer("cpu", scene, near=near))
+    if not shown_by(scene.means, cameras, near).together:
+        check_something_seen(scene, cameras, make_rasterizer("cpu", scene, near=near))
 
 
 def together(collectives: Collectives, make: Callable[[], T]) -> T:

@@ -12,7 +12,7 @@ from PIL import Image
 from api.cli.scene_tools import render_panorama
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.formats import by_name
-from sgsst_core.files.images import BLACK, WHITE, check_names, find_masks, load_photo, save_png
+from sgsst_core.files.images import BLACK, check_names, find_masks, load_photo, save_png
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import FACES
@@ -21,7 +21,7 @@ from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.objects import figure, ground, joined
 from tests.small_scenes import ball, cameras, wall, write_files
-from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
+from worker.capture import Capture, about_notes, about_rendering, choose_axes, read_capture
 from worker.derived import video_cameras
 from worker.inputs import read_scene_and_capture
 from worker.job import SceneRequest
@@ -86,14 +86,13 @@ def test_photos_mostly_without_cameras_or_with_several_are_reported(tmp_path: Pa
     )
 
 
-def test_photos_of_another_size_and_missing_ones_are_reported(tmp_path: Path) -> None:
+def test_photos_may_have_another_size_and_missing_ones_are_reported(tmp_path: Path) -> None:
     capture = read_capture(request(tmp_path), SCENE)
     photos = write_photos(tmp_path / "photos", ["view_0", "view_2"], (128, 96))
     with_photos = capture.with_photos(photos)
     assert [view.name for view in with_photos.cameras] == ["view_0", "view_2"]
     assert lines(with_photos) == [
         "photos: warning: 1 of 3 views are left out: they have no photo: view_1",
-        "photos: 2 are resized to their views: they have other sizes, such as 128x96 instead of 64x48",
     ]
     (photos / "view_7.png").write_bytes((photos / "view_2.png").read_bytes())
     assert "photos: 1 files are not used: they have the name of no camera: view_7.png" in lines(
@@ -318,15 +317,3 @@ def test_plan_names_render_mode_and_warnings(
     assert [line.decision for line in lines] == decisions
     assert reason is None or "".join(line.reason for line in lines) == reason
     assert {line.item for line in lines} <= {"rendering"}
-
-
-def test_white_background_of_the_run_is_reported(tmp_path: Path) -> None:
-    path = tmp_path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
-    assert about_background(path, BLACK) == []
-    (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3, white_background=True)")
-    (line,) = about_background(path, BLACK)
-    assert line.decision.startswith("warning: the scene was trained on white")
-    assert line.reason == f"{tmp_path}/cfg_args has white_background=True; add --background white"
-    assert about_background(path, WHITE) == about_background(tmp_path / "a" / "b" / "scene.ply", BLACK) == []
-    (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3, white_background=False)")
-    assert about_background(path, BLACK) == []

@@ -259,7 +259,6 @@ VALUES = [
         [],
         None,
         ("a",),
-        [(640, 480)],
         [Photo(Path("a.jpg"), (640, 480), oriented=True)],
         (Decision("axes", "rub", "seen"),),
     ),
