@@ -81,7 +81,7 @@ def execute(
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
         callbacks.preview_seconds = 0.0  # `Previews` itself limits how often a preview is written
         if preview and not _has_rows_of_file(job):
-            preview.live.share_scene(stylizer.job.scene)
+            preview.share_scene(stylizer.job.scene)
     stopped = run(stylizer, callbacks)
     if first and stopped in ("on-request", "within", "target-loss", "converged"):
         expected = estimate(stylizer.job)

@@ -119,31 +119,31 @@ def prepare(
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
     if preview and not resumed and collectives.rank == 0:
         preview.write_first(inputs, settings)
-    known: Checkpoint | _HandedOver | None = resumed
+    known, known_ranks = resumed.plan if resumed else None, resumed.ranks if resumed else 0
     if plan_file and not resumed:
-        known = collectives.broadcast(lambda: _handed_over(plan_file, fingerprint, inputs, settings))
-    chosen = known.plan.time_choice if known else None
+        known, known_ranks = collectives.broadcast(lambda: _handed_over(plan_file, fingerprint, inputs, settings))
+    chosen = known.time_choice if known else None
     if not known:
         with timer("planning"):
             chosen = left and choose_within(_job_inputs(inputs, settings, weights), left, collectives)
     asked, settings = settings, chosen.applied(settings) if chosen else settings
     inputs = inputs.chosen(chosen, settings) if chosen else inputs
-    refinement, scene_file = known.plan.refinement if known else None, inputs.scene_file
+    refinement, scene_file = known.refinement if known else None, inputs.scene_file
     if settings.growth > 1:
         with timer("refining"):
             of_job = _job_inputs(inputs, settings, weights)
             refinement = refinement if known else refine(of_job, collectives=collectives, show=show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
-    plan = _usable_plan(known, collectives)
-    if known and not plan and known.plan.device == common_device(collectives):
-        asked = asked.model_copy(update={"precision": known.plan.precision})  # a job has one precision
-    planned_ranks = known.ranks if known and plan else collectives.size
+    plan = known if known and collectives.size <= known_ranks and _is_usable(known, collectives) else None
+    if known and not plan and known.device == common_device(collectives):
+        asked = asked.model_copy(update={"precision": known.precision})  # a job has one precision
+    planned_ranks = known_ranks if plan else collectives.size
     of_job = _job_inputs(inputs, asked, weights, chosen).refined(refinement, scene_file.scene)
     stylization = plan_job(
         replace(of_job, photos=inputs.photo_loader(settings.background)),
         plan=plan,
         collectives=collectives,
-        survey=known.plan.survey if known else None,
+        survey=known.survey if known else None,
         groups=resumed.plan.groups if resumed else None,
         show=show_planning,
         timer=timer,
@@ -187,20 +187,10 @@ def dry_run(
     return job
 
 
-@dataclass(frozen=True)
-class _HandedOver:
-    """Plan that a dry run has handed over.
+def _handed_over(file: Path, fingerprint: str, inputs: Inputs, settings: Settings) -> tuple[Plan | None, int]:
+    """Return the plan of a dry run of the same job, and the number of ranks for which it was made.
 
-    Attributes:
-        ranks: Number of ranks for which it was made; 0 if only its survey and its refinement can be used here.
-    """
-
-    plan: Plan
-    ranks: int
-
-
-def _handed_over(file: Path, fingerprint: str, inputs: Inputs, settings: Settings) -> _HandedOver | None:
-    """Return the plan of a dry run of the same job; None if there is none.
+    The plan is None if there is none. The number is 0 if only its survey and its refinement can be used here.
 
     The fingerprint covers the content of all inputs, and the settings that determine the course of the job. A plan
     holds for the same settings, machine and versions alone; otherwise, only its survey is used.
@@ -208,8 +198,8 @@ def _handed_over(file: Path, fingerprint: str, inputs: Inputs, settings: Setting
     try:
         plan, conditions = load_plan(file, fingerprint, inputs.scene_file.scene, inputs.cameras)
     except CheckpointError:
-        return None
-    return _HandedOver(plan, int(conditions == _conditions(settings)))
+        return None, 0
+    return plan, int(conditions == _conditions(settings))
 
 
 def _conditions(settings: Settings) -> str:
@@ -229,19 +219,15 @@ def _job_inputs(
     )  # fmt: skip
 
 
-def _usable_plan(known: Checkpoint | _HandedOver | None, collectives: Collectives) -> Plan | None:
-    """Return the plan that is known already; None if there is none or it cannot be used on this machine.
+def _is_usable(plan: Plan, collectives: Collectives) -> bool:
+    """Return whether a plan can be used on these machines; one that was made for another device cannot.
 
-    A plan made for another device or for fewer ranks cannot be used. If the plan uses a GPU rasterizer, its kernels are
-    compiled and checked here: compiling may take longer than ranks wait for each other during a step.
+    If it uses a GPU rasterizer, its kernels are compiled and checked here: compiling may take longer than ranks wait
+    for each other during a step.
     """
-    if known is None or collectives.size > known.ranks:
-        return None
-    plan = known.plan
     if plan.device != common_device(collectives):
-        return None
-    on_gpu = RASTERIZERS[plan.uncached].on_gpu
-    return None if on_gpu and rasterizer_problem(collectives, plan.uncached) else plan
+        return False
+    return not RASTERIZERS[plan.uncached].on_gpu or not rasterizer_problem(collectives, plan.uncached)
 
 
 def _workers_used(stylizer: Stylizer) -> dict[str, Any]:
@@ -327,9 +313,8 @@ def describe_scene(file: SceneFile) -> str:
 def _describe_views(job: Job) -> str:
     views = job.stylizer.job.views
     sizes = sorted({(camera.width, camera.height) for camera in views.cameras})
-    text = f"{len(views)} of {sizes[0][0]}x{sizes[0][1]}"
-    if len(sizes) > 1:
-        text = f"{len(views)} of {len(sizes)} sizes, {sizes[0][0]}x{sizes[0][1]} to {sizes[-1][0]}x{sizes[-1][1]}"
+    ends = dict.fromkeys(f"{width}x{height}" for width, height in (sizes[0], sizes[-1]))
+    text = f"{len(views)} of {' to '.join(ends)}"
     tiling = job.stylizer.job.loss.tiling
     scales = max(tiling.scale_count((height, width)) for width, height in sizes)
     chosen = max(len(tiling.scales((height, width))) for width, height in sizes)
@@ -368,9 +353,12 @@ class Previews:
     before the first step on a GPU. It has the colors of a warm start, so that users get a first impression of the
     result within seconds.
 
+    The current colors are written for clients that watch the job in 3D, each time in place of the former ones.
+    Gaussians that no view shows have their original colors, because theirs are computed only at the end.
+
     Args:
-        folder: Folder of the JPEGs (`step_0000123.jpg`). It is created with the first preview. Colors are written to
-            the folder `live` beside it.
+        folder: Folder of the JPEGs (`step_0000123.jpg`). It is created with the first preview. Colors (`colors.f16`)
+            are written to the folder `live` beside it.
         seconds: Minimum seconds between two previews, except for the first ones.
         warn: Callback that receives the reason why a preview is missing. A missing preview does not fail the job.
     """
@@ -379,10 +367,10 @@ class Previews:
         self._folder = folder
         self._seconds = seconds
         self._warn = warn
-        self._started = time.monotonic()
+        self._started = self._colors_due = time.monotonic()
         #: Time of the last preview; None before the first.
         self._last: float | None = None
-        self.live = LiveColors(folder.parent / "live", warn)
+        self._live = folder.parent / "live"
 
     def write_first(self, inputs: Inputs, settings: Settings) -> None:
         """Write the first preview of a job that has not been planned, unless a GPU will plan it within seconds."""
@@ -396,7 +384,8 @@ class Previews:
 
     def __call__(self, stylizer: Stylizer) -> None:
         """Write a preview and the colors, each if enough time has passed since the last time."""
-        self.live(stylizer)
+        if stylizer.step and time.monotonic() >= self._colors_due:
+            self._write_colors(stylizer)
         now, last = time.monotonic(), self._last
         elapsed = now - self._started
         wait = max(min(self._seconds, max(_FIRST_SECONDS, _FIRST_SHARE * elapsed)), _SHARE * elapsed)
@@ -410,6 +399,21 @@ class Previews:
             before = _rendered(stylizer, stylizer.job.views.scene.sh_dc.to(stylizer.sh_dc.device), THUMBNAIL_SIDE)
             after = _rendered(stylizer, stylizer.shown(), THUMBNAIL_SIDE)
             save_thumbnail(self._folder, before, after)
+
+    def share_scene(self, scene: Scene) -> None:
+        """Write the scene to which the colors belong (`scene.ply`), whose rows are not those of the job's input."""
+        with _warning(self._warn, _NO_COLORS):
+            write_scene(_created(self._live) / "scene.ply", scene)
+
+    def _write_colors(self, stylizer: Stylizer) -> None:
+        started = time.monotonic()
+        with _warning(self._warn, _NO_COLORS):
+            colors = stylizer.job.scene.sh_dc.clone()
+            colors[stylizer.job.plan.seen] = stylizer.shown().cpu()
+            write_colors(_created(self._live) / "colors.f16", colors)
+        now = time.monotonic()
+        wait = max(_COLOR_SECONDS, _COLOR_SHARE * (now - self._started), (now - started) / _COST_SHARE)
+        self._colors_due = now + wait
 
     def _write(self, step: int, render: Callable[[], Tensor | None]) -> None:
         """Write the preview of a step, if there is an image to write."""
@@ -463,36 +467,3 @@ def _rendered(stylizer: Stylizer, colors: Tensor, side: int) -> Tensor:
     camera = resized(camera, min(camera.side, side))
     with torch.no_grad():
         return views.rasterizer.render(views.colors(index, colors), camera)
-
-
-class LiveColors:
-    """Writer of a job's current colors (`colors.f16`), each time in place of the former ones.
-
-    Gaussians that no view shows have their original colors, because theirs are computed only at the end.
-
-    Args:
-        folder: Folder of the files. It is created with the first one.
-        warn: Callback that receives the reason why a file is missing. A missing file does not fail the job.
-    """
-
-    def __init__(self, folder: Path, warn: Callable[[str], None]) -> None:
-        self._folder = folder
-        self._warn = warn
-        self._started = self._due = time.monotonic()
-
-    def share_scene(self, scene: Scene) -> None:
-        """Write the scene to which the colors belong (`scene.ply`), whose rows are not those of the job's input."""
-        with _warning(self._warn, _NO_COLORS):
-            write_scene(_created(self._folder) / "scene.ply", scene)
-
-    def __call__(self, stylizer: Stylizer) -> None:
-        """Write the colors after a step if enough time has passed since the last time."""
-        started = time.monotonic()
-        if not stylizer.step or started < self._due:
-            return
-        with _warning(self._warn, _NO_COLORS):
-            colors = stylizer.job.scene.sh_dc.clone()
-            colors[stylizer.job.plan.seen] = stylizer.shown().cpu()
-            write_colors(_created(self._folder) / "colors.f16", colors)
-        now = time.monotonic()
-        self._due = now + max(_COLOR_SECONDS, _COLOR_SHARE * (now - self._started), (now - started) / _COST_SHARE)

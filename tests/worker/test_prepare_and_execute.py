@@ -26,7 +26,7 @@ from worker import prepare as previews_module
 from worker.execute import execute
 from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume
-from worker.prepare import Job, LiveColors, Previews, dry_run, prepare
+from worker.prepare import Job, Previews, dry_run, prepare
 from worker.run import Listener
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -302,10 +302,10 @@ def test_live_colors_are_those_of_the_step(stylizer: Stylizer, tmp_path: Path, m
         monkeypatch.setattr(previews_module, name, 0)
     monkeypatch.setattr(previews_module, "_COST_SHARE", 1e9)
     missing: list[str] = []
-    colors, by_step = LiveColors(tmp_path / "live", missing.append), {}
+    previews, by_step = Previews(tmp_path / "previews", 3600, missing.append), {}
 
     def preview(stylizer: Stylizer) -> None:
-        colors(stylizer)
+        previews(stylizer)
         if not stylizer.step:
             return
         seen = stylizer.job.plan.seen

@@ -23,7 +23,7 @@ from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedEr
 from worker.job import JobSpec, Result, Resume, scene_bytes
 from worker.processes import ProcessId, home, kill
 from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, first_line, reserve
-from worker.ranks.rank import Outcome, RankPlace, RankProcess, RankStatus, RankTask, WorkerOptions, Workplace
+from worker.ranks.rank import RankPlace, RankProcess, RankStatus, RankTask, WorkerOptions, Workplace
 from worker.run import Ended, Listener, LostAttempt
 
 if TYPE_CHECKING:
@@ -130,20 +130,18 @@ class _Attempts:
     def _watch(self) -> Result | None:
         first = self._group.handles[0]
         deadline: float | None = None
-        finishing = False
         while True:
             if deadline is None and self._listener.stop():
                 deadline = time.monotonic() + STOP_SECONDS
                 first.actor.stop.remote()
-            if not finishing and self._listener.finish():
-                finishing = True
+            if self._listener.finish():
                 first.actor.finish.remote()
             if deadline is not None and time.monotonic() > deadline:
                 return None
             poll_ranks(self._group)
             self._relay.pass_on(first.status)
-            if first.outcome is not None and first.outcome.error is None:
-                return first.outcome.result
+            if (outcome := first.status.outcome) and outcome.error is None:
+                return outcome.result
             look_for_losses(self._group, self._cluster, self._options.rank_timeout)
 
     def _task(self, number: int, address: str) -> RankTask:
@@ -237,15 +235,13 @@ class Relay:
             self.stored.append(file)
             self._listener.stored(file)
         self._reported_files = len(status.stored)
-        if status.progress is not None and not status.progress.is_step:
-            self._pass_on_progress(status.progress)
         if status.prepared is not None and self.first_step is None:
             self.first_step = self.last_step = status.prepared.step
             self.total = status.prepared.total
             if not self._prepared:
                 self._prepared = True
                 self._listener.prepared(status.prepared)
-        if status.progress is not None and status.progress.is_step:
+        if status.progress is not None and status.progress != self._progress:
             self._pass_on_progress(status.progress)
         if status.saved is not None and status.saved != self.saved:
             self.saved, self.safe_at = status.saved, time.monotonic()
@@ -253,8 +249,6 @@ class Relay:
             self.step = max(self.step, self.last_step)
 
     def _pass_on_progress(self, progress: Progress) -> None:
-        if progress == self._progress:
-            return
         self._progress = progress
         if progress.is_step and progress.step != self.last_step:
             if self.last_step == self.first_step:
@@ -300,11 +294,6 @@ class RankHandle:
     polled_at: float = 0.0
     answered_at: float = field(default_factory=time.monotonic)
     status: RankStatus = field(default_factory=RankStatus)
-
-    @property
-    def outcome(self) -> Outcome | None:
-        """Return the outcome of the rank; None while it runs."""
-        return self.status.outcome
 
     @property
     def silence(self) -> float:
@@ -433,11 +422,12 @@ def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> 
         raise AttemptFailedError("machine", "Ray's own processes on this machine were lost")
     now, broken = time.monotonic(), None
     for rank in group.handles:
-        if rank.outcome is None or rank.outcome.error is None:
+        outcome = rank.status.outcome
+        if outcome is None or outcome.error is None:
             continue
-        name, error = group.name_of(rank), rank.outcome.error
-        if not rank.outcome.echo:
-            error.add_note(f"{name}:\n{rank.outcome.trace}")
+        name, error = group.name_of(rank), outcome.error
+        if not outcome.echo:
+            error.add_note(f"{name}:\n{outcome.trace}")
             raise failure_of(error, name)
         broken = broken or f"{name} lost its connection: {first_line(error)}"
         group.broken_at = group.broken_at or now

@@ -258,12 +258,7 @@ class RankProcess:
                 self._update(outcome=_failure(error))
         finally:
             if place is not None:
-                self._leave(place)
-
-    @staticmethod
-    def _leave(place: OpenWorkplace) -> None:
-        os.chdir("/")
-        place.close()
+                place.close()
 
     def _work(self, task: RankTask, place: OpenWorkplace | None) -> None:
         import torch
@@ -281,7 +276,6 @@ class RankProcess:
                 result = self._job(task, collectives)
                 if place is not None:
                     place.finish(done=result.stopped != "interrupted")
-                    self._leave(place)
                 self._update(outcome=Outcome(result))
             except BaseException as error:
                 self._update(outcome=_failure(error))
