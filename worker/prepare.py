@@ -285,13 +285,9 @@ def describe(job: Job) -> Prepared:
         ("network", _describe_network(job)),
     ]
     lines += [(decision.item, f"{decision.decision}: {decision.reason}") for decision in stylizer.job.plan.decisions]
-    rate = f"learning rate {settings.learning_rate:g}"
-    if settings.learning_rate_end != settings.learning_rate:
-        rate += f" to {settings.learning_rate_end:g}"
+    rates = f"learning rate {settings.learning_rate:g} to {settings.learning_rate_end:g}"
     steps = f"{stylizer.job.plan.steps_coarse} steps on the coarsest scale, then {settings.steps_sos} on all"
-    if not stylizer.job.plan.steps_coarse:
-        steps = f"{settings.steps_sos} steps"
-    lines.append(("schedule", f"{steps}; {rate} (preset {settings.preset})"))
+    lines.append(("schedule", f"{steps}; {rates} (preset {settings.preset})"))
     if job.resumed:
         lines.append(("resuming", f"at step {job.resumed.state.step} of {stylizer.job.total_steps}"))
     elif job.outputs.checkpoint.exists():

@@ -264,9 +264,11 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
     cores = [int(node.get("CPU", 0)) for node in nodes]
     threads = _threads(cores, wanted)
     wanted = min(wanted, sum(count // threads for count in cores))
+    # A job that needs more memory than any machine has gets all of the largest machine's, and may still succeed there.
+    most = max((int(node.get("memory", 0)) for node in nodes if node.get("GPU")), default=0)
+    of_gpu = {"GPU": 1, "memory": min(memory_beside_gpus(1, scene), most)} if gpus else {}
     while wanted > 0:
-        bundles = [_bundle(nodes, wanted, threads, scene)] * wanted
-        group = placement_group(bundles, strategy="PACK" if gpus else "SPREAD")
+        group = placement_group([{"CPU": threads, **of_gpu}] * wanted, strategy="PACK" if gpus else "SPREAD")
         reservation = Reservation(group, wanted, threads, 1 if gpus else 0)
         if group.wait(PLACE_SECONDS):
             return reservation
@@ -275,7 +277,7 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
             threads = 1
         else:
             wanted -= 1
-    needed = ", ".join(f"{name} {amount:,}" for name, amount in _bundle(nodes, 1, threads, scene).items())
+    needed = ", ".join(f"{name} {amount:,}" for name, amount in {"CPU": threads, **of_gpu}.items())
     raise NoCapacityError(f"Ray has no capacity for a worker, which needs {needed}")
 
 
@@ -285,15 +287,3 @@ def _threads(cores: list[int], ranks: int) -> int:
         (each for each in range(1, max(cores, default=1) + 1) if sum(count // each for count in cores) >= ranks),
         default=1,
     )
-
-
-def _bundle(nodes: list[dict[str, float]], ranks: int, threads: int, scene: int) -> dict[str, int]:
-    """Return the Ray resources of each of `ranks` ranks."""
-    with_gpus = [node for node in nodes if node.get("GPU")]
-    if not with_gpus:
-        return {"CPU": threads}
-    sharing = min(ranks, max(int(node["GPU"]) for node in with_gpus))
-    # A job that needs more memory than any machine has gets all of the largest machine's, and may still succeed there.
-    most = max(int(node.get("memory", 0)) for node in with_gpus) // sharing
-    memory = min(memory_beside_gpus(1, scene), most)
-    return {"CPU": threads, "GPU": 1, **({"memory": memory} if memory else {})}

@@ -210,7 +210,6 @@ class Relay:
         self.saved: int | None = None
         self.first_step: int | None = None
         self.safe_at = time.monotonic()
-        self._prepared = False
         self._progress: Progress | None = None
         self._warned = self._reported_files = 0
         self.stored: list[Any] = []
@@ -236,11 +235,10 @@ class Relay:
             self._listener.stored(file)
         self._reported_files = len(status.stored)
         if status.prepared is not None and self.first_step is None:
+            if not self.total:  # else an earlier attempt was prepared
+                self._listener.prepared(status.prepared)
             self.first_step = self.last_step = status.prepared.step
             self.total = status.prepared.total
-            if not self._prepared:
-                self._prepared = True
-                self._listener.prepared(status.prepared)
         if status.progress is not None and status.progress != self._progress:
             self._pass_on_progress(status.progress)
         if status.saved is not None and status.saved != self.saved:

@@ -296,14 +296,8 @@ class ProcessGroupCollectives(Collectives):
 
     def all_gather(self, value: T) -> list[T]:
         """See `Collectives`."""
-        message = encode(value)
-        sizes = [torch.empty(1, dtype=torch.int64) for _ in range(self.size)]
-        dist.all_gather(sizes, torch.tensor([len(message)]), group=self._group)
-        padded = message.new_zeros(int(max(sizes)))
-        padded[: len(message)] = message
-        messages = [torch.empty_like(padded) for _ in range(self.size)]
-        dist.all_gather(messages, padded, group=self._group)
-        return [decode(each[: int(size)]) for each, size in zip(messages, sizes, strict=True)]
+        own = encode(value)
+        return [decode(self._broadcast(rank, own)) for rank in range(self.size)]
 
     def broadcast(self, make: Callable[[], T]) -> T:
         """See `Collectives`."""
@@ -313,16 +307,20 @@ class ProcessGroupCollectives(Collectives):
                 message = encode((make(), None))
             except SgsstError as error:
                 message = encode((None, error))
-        size = torch.tensor([len(message)])
-        dist.broadcast(size, group=self._group, group_src=0)
-        if self.rank != 0:
-            message = message.new_empty(int(size))
-        dist.broadcast(message, group=self._group, group_src=0)
         value: T
-        value, problem = decode(message)
+        value, problem = decode(self._broadcast(0, message))
         if problem is not None:
             raise problem
         return value
+
+    def _broadcast(self, source: int, message: Tensor) -> Tensor:
+        """Return the message of a rank, given that of this rank."""
+        size = torch.tensor([len(message)])
+        dist.broadcast(size, group=self._group, group_src=source)
+        if self.rank != source:
+            message = message.new_empty(int(size))
+        dist.broadcast(message, group=self._group, group_src=source)
+        return message
 
     def set_timeout_for(self, iteration_seconds: float) -> None:
         """See `Collectives`."""

@@ -15,7 +15,7 @@ from sgsst_core.progress import Progress
 from worker.job import memory_beside_gpus, scene_bytes
 from worker.prepare import Prepared
 from worker.processes import home
-from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, reserve
+from worker.ranks.cluster import Cluster, NoCapacityError, reserve
 from worker.ranks.driver import MOST_ATTEMPTS, AttemptFailedError, Relay, check_retry, failure_of
 from worker.ranks.rank import RankStatus
 from worker.run import Listener, LostAttempt
@@ -159,26 +159,6 @@ def test_scene_memory_is_its_decompressed_size() -> None:
     assert memory_beside_gpus(4, 5 * GB) == 52 * GB, "every rank reads the scene"
 
 
-GPUS, MANY_CORES = {"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}, {"CPU": 64.0, "memory": 500.0 * GB}
-
-
-@pytest.mark.parametrize(
-    ("nodes", "ranks", "scene", "resources"),
-    [
-        ([GPUS, MANY_CORES], 1, 5 * GB, {"GPU": 1, "memory": 13 * GB}),
-        ([GPUS, MANY_CORES, GPUS], 8, 5 * GB, {"GPU": 1, "memory": 13 * GB}),  # four on each machine
-        ([GPUS], 1, 200 * GB, {"GPU": 1, "memory": 100 * GB}),  # a whole machine's
-        ([GPUS], 4, 200 * GB, {"GPU": 1, "memory": 25 * GB}),
-        ([{"CPU": 32.0, "memory": 100.0 * GB}], 2, 5 * GB, {}),  # plans limit their memory already
-        ([{"CPU": 32.0, "GPU": 4.0}], 2, 5 * GB, {"GPU": 1}),  # Ray knows of no memory
-    ],
-)
-def test_ranks_request_cores_gpus_and_memory_for_their_scene(
-    nodes: list[dict[str, float]], ranks: int, scene: int, resources: dict[str, float]
-) -> None:
-    assert _bundle(nodes, ranks, 8, scene) == {"CPU": 8, **resources}
-
-
 @contextmanager
 def taken(memory: int) -> Iterator[None]:
     """Reserve memory of the cluster within the block, as another job would."""
@@ -194,18 +174,18 @@ def taken(memory: int) -> Iterator[None]:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends processes with their parent")
 @pytest.mark.usefixtures("joined")
 def test_ray_grants_no_gpus_without_free_memory() -> None:
-    """The cluster has two GPUs and 10 GB; a scene of 2 GB needs 10 GB with two ranks and 7 GB with one."""
+    """The cluster has two GPUs and 10 GB; a rank with a scene of 1 GB needs 5 GB."""
     with Cluster(2):
-        reserved = reserve(2, 2 * GB)
+        reserved = reserve(2, GB)
         assert reserved.ranks == 2
         reserved.release()
         with taken(3 * GB):
-            fewer = reserve(2, 2 * GB)
+            fewer = reserve(2, GB)
             assert (fewer.ranks, fewer.gpus) == (1, 1)
             fewer.release()
-        with taken(4 * GB), pytest.raises(NoCapacityError, match="needs CPU 1, GPU 1, memory 7,000,000,000"):
-            reserve(2, 2 * GB)
-        again = reserve(2, 2 * GB)
+        with taken(6 * GB), pytest.raises(NoCapacityError, match="needs CPU 1, GPU 1, memory 5,000,000,000"):
+            reserve(2, GB)
+        again = reserve(2, GB)
         assert again.ranks == 2, "what was waited for in vain is not asked for any more"
         again.release()
 

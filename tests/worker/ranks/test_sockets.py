@@ -86,24 +86,19 @@ class Evil:
         return os.mkdir, (str(self.path),)
 
 
-def send_raw(data: bytes, *, broadcast: bool) -> None:
-    """Send raw bytes in place of a message: their number, then the bytes, padded to the longest message's length."""
-    size, message = torch.tensor([len(data)]), torch.frombuffer(bytearray(data), dtype=torch.uint8)
-    if broadcast:
-        dist.broadcast(size, 0)
-        dist.broadcast(message, 0)
-        return
-    sizes = [torch.empty_like(size) for _ in range(2)]
-    dist.all_gather(sizes, size)
-    padded = torch.zeros(int(max(sizes)), dtype=torch.uint8)
-    padded[: len(data)] = message
-    dist.all_gather([torch.empty_like(padded) for _ in range(2)], padded)
+def send_raw(data: bytes, source: int) -> None:
+    """Send raw bytes in place of a message of rank `source`, after receiving those of the ranks below it."""
+    message = torch.frombuffer(bytearray(data), dtype=torch.uint8)
+    for rank in range(source + 1):
+        size = torch.tensor([len(data)])
+        dist.broadcast(size, rank)
+        dist.broadcast(message if rank == source else torch.empty(int(size), dtype=torch.uint8), rank)
 
 
 def receive(collectives: Collectives, path: Path, broadcast: bool) -> str:
     """Send a pickle from one rank to the other, and return the error message of the receiver."""
     if collectives.rank == (0 if broadcast else 1):
-        send_raw(pickle.dumps(Evil(path)), broadcast=broadcast)
+        send_raw(pickle.dumps(Evil(path)), collectives.rank)
         return ""
     try:
         collectives.broadcast(lambda: None) if broadcast else collectives.all_gather(None)
