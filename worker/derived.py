@@ -54,8 +54,18 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
-from worker.capture import Capture, about_notes, about_rendering, choose_axes, orbit_request, read_capture
-from worker.inputs import check_something_in_view, cropped, read_job_capture, read_requested
+from worker.inputs import (
+    Capture,
+    about_notes,
+    about_rendering,
+    check_something_in_view,
+    choose_axes,
+    cropped,
+    orbit_request,
+    read_capture,
+    read_job_capture,
+    read_requested,
+)
 from worker.job import JobSpec, SceneRequest, check_choice, check_folder, check_is_not_input, result_format
 from worker.options import DEFAULT_SIDE, MOST_VIEWPOINT_NAME, VideoOptions, Viewpoint, Viewpoints
 from worker.prepare import describe_scene

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -29,9 +28,7 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from worker.job import CONTINUABLE, Result
 from worker.options import RunOptions
 from worker.prepare import Job, Previews, Warn
-
-if TYPE_CHECKING:
-    from worker.run import Listener
+from worker.run import Listener
 
 #: Default seconds between checkpoints. If a rank is lost, at most this much work is repeated.
 CHECKPOINT_SECONDS = RunOptions().checkpoint_seconds

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -26,23 +26,22 @@ from sgsst_core.rasterizer.base import Color, Rasterizer
 from sgsst_core.report.document import PLAN_VERSION, REPORT_VERSION
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.spherical_harmonics import scene_colors
-from worker.capture import Capture, read_capture
 from worker.inputs import (
     STYLE_PIXELS,
+    Capture,
     InputLimits,
     check_frames_have_sizes,
     check_something_in_view,
     errors_of,
+    read_capture,
     read_requested,
     read_scene_and_capture,
 )
 from worker.job import JobSpec, Outputs, Result, SceneRequest, check_choice, check_request, check_suffix
 from worker.options import CameraParameters, PaintedFile, PaintedOptions
 from worker.prepare import THUMBNAIL_SIDE, Prepared, describe_scene, save_thumbnail
-
-if TYPE_CHECKING:
-    from worker.ranks.rank import WorkerOptions
-    from worker.run import Listener
+from worker.ranks.rank import WorkerOptions
+from worker.run import Listener
 
 #: Text chunk of a PNG with the view that it shows, as `PaintedOptions`.
 _CHUNK = "sgsst-view"

@@ -268,7 +268,7 @@ def _renders(requests: Sequence[tuple[str, JobSpec]]) -> list[tuple[str, Tensor]
     """Return a render of a scene and of each of its results, with their names; None for those that are missing."""
     from sgsst_core.files.scene_file import read_scene
     from sgsst_core.report.images import small_renders
-    from worker.capture import read_capture
+    from worker.inputs import read_capture
 
     source = requests[0][1].source.model_copy(update={"resolution": None})
     scene = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes).scene

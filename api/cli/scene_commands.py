@@ -297,9 +297,8 @@ def view(
 ) -> None:
     """Write a scene as one HTML file, which shows it in 3D in a browser, without a server."""
     from api.static_files import exported_viewer
-    from worker.capture import read_capture
     from worker.derived import viewpoint_of, write_page
-    from worker.inputs import read_requested
+    from worker.inputs import read_capture, read_requested
     from worker.painting import camera_named
 
     check_suffix(out, "an HTML file", "scene.html")

@@ -34,9 +34,8 @@ from sgsst_core.report.images import write_views
 from sgsst_core.scene.camera import Camera, faces_to_render, join_faces, level, resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.style import STARRY_NIGHT
-from worker.capture import orbit_request
 from worker.derived import blend
-from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
+from worker.inputs import check_something_seen, orbit_request, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice, check_is_not_input, check_suffix
 from worker.options import ViewOptions, split_weight
 from worker.painting import camera_named

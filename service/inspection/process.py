@@ -53,9 +53,8 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import STARRY_NIGHT
 from sgsst_core.stylizing.checkpoint import versions
 from sgsst_core.stylizing.planner import estimate
-from worker.capture import choose_axes, orbit_request
 from worker.derived import VideoRequest, blend, convert, render_video, write_page, write_poster
-from worker.inputs import Inputs, cropped, errors_of, read_inputs, read_job_capture
+from worker.inputs import Inputs, choose_axes, cropped, errors_of, orbit_request, read_inputs, read_job_capture
 from worker.job import SceneRequest, check_steps
 from worker.options import JobVideo, Viewpoint, Viewpoints
 from worker.painting import PaintInputs, read_paintings

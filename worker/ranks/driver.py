@@ -17,18 +17,15 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedError, SgsstError
+from sgsst_core.progress import Progress
 from worker.job import JobSpec, Result, Resume, scene_bytes
 from worker.processes import ProcessId, home, kill
 from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, first_line, reserve
 from worker.ranks.rank import RankPlace, RankProcess, RankStatus, RankTask, WorkerOptions, Workplace
 from worker.run import Ended, Listener, LostAttempt
-
-if TYPE_CHECKING:
-    from sgsst_core.progress import Progress
-
 
 #: Seconds that an interrupted job has to finish its step and save a checkpoint.
 STOP_SECONDS = 10.0

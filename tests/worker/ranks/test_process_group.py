@@ -37,7 +37,7 @@ from tests.ports import free_port
 from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
-from worker.capture import Capture
+from worker.inputs import Capture
 from worker.job import Outputs
 from worker.ranks.process_group import _backend, _meet
 from worker.ranks.rank import _failure

@@ -21,9 +21,8 @@ from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.objects import figure, ground, joined
 from tests.small_scenes import ball, cameras, wall, write_files
-from worker.capture import Capture, about_notes, about_rendering, choose_axes, read_capture
 from worker.derived import video_cameras
-from worker.inputs import read_scene_and_capture
+from worker.inputs import Capture, about_notes, about_rendering, choose_axes, read_capture, read_scene_and_capture
 from worker.job import SceneRequest
 from worker.options import VideoOptions
 
