@@ -40,8 +40,7 @@ from worker.inputs import (
 from worker.job import JobSpec, Outputs, Result, SceneRequest, check_choice, check_request, check_suffix
 from worker.options import CameraParameters, PaintedFile, PaintedOptions
 from worker.prepare import THUMBNAIL_SIDE, Prepared, describe_scene, save_thumbnail
-from worker.ranks.rank import WorkerOptions
-from worker.run import Listener
+from worker.run import Listener, WorkerOptions
 
 #: Text chunk of a PNG with the view that it shows, as `PaintedOptions`.
 _CHUNK = "sgsst-view"

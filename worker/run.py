@@ -1,23 +1,115 @@
 """Runner of a job, for the command line, the service and every rank: `stylize` runs a whole job, `run_rank` one rank.
 
-Neither PyTorch nor Ray is imported before a job runs: the driver of several ranks computes nothing itself.
+One of several ranks is a Ray actor (`RankProcess`) that runs the job in a thread and reports its status to the driver.
+
+Neither PyTorch nor Ray is imported before a job runs: the driver of several ranks computes nothing itself, and a rank
+first sets the environment variables for thread counts and GPUs.
 """
 
 from __future__ import annotations
 
 import gc
+import os
+import pickle
+import socket
+import sys
+import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
+from sgsst_core.errors import InfrastructureError
+from sgsst_core.progress import Progress
 from worker.job import JobSpec, Result, Resume
-from worker.ranks.rank import WorkerOptions
+from worker.options import RunOptions
+from worker.processes import ProcessId, die_with_parent, listen
 
 if TYPE_CHECKING:
     from sgsst_core.parallel.collectives import Collectives
-    from sgsst_core.progress import Progress
     from worker.prepare import Prepared
+
+#: Seconds by which the timeout of an exchange between ranks exceeds the driver's. The driver should time out first,
+#: because it knows which rank does not respond.
+_PATIENCE = 15.0
+
+
+#: Callback for each file that was stored outside this machine. It receives a description of the file, whose type the
+#: implementation chooses, and the step if the file is a checkpoint (else None).
+Stored = Callable[[Any, int | None], None]
+
+
+class OpenWorkplace(Protocol):
+    """Open folder on this machine that holds the files of a job; see `Workplace`."""
+
+    folder: Path
+
+    def finish(self, *, done: bool) -> None:
+        """Store the files that have not been stored yet. Only rank 0 stores files.
+
+        Args:
+            done: Whether the job has written its results.
+
+        Raises:
+            InfrastructureError: If they cannot be stored.
+        """
+
+    def close(self) -> None:
+        """Delete the folder."""
+
+
+class Workplace(Protocol):
+    """Factory of folders with the files of a job whose ranks run on machines without a shared folder.
+
+    It is pickled and sent to every rank. The program that starts the job implements it: only it knows where the files
+    come from and where results are stored.
+    """
+
+    @property
+    def scene_bytes(self) -> int:
+        """Return the bytes that the job's scene needs in memory, estimated from its file."""
+
+    def open(self, rank: int, stored: Stored) -> OpenWorkplace:
+        """Create the folder with the job's files. On rank 0, also start to store new output files.
+
+        Raises:
+            InfrastructureError: If the files cannot be fetched, or the disk is full.
+        """
+
+    def after(self, stored: Sequence[Any]) -> Workplace:
+        """Return the workplace of the next attempt, which resumes from the stored files."""
+
+    def tidy(self) -> None:
+        """Delete folders that killed ranks have left on this machine."""
+
+
+@dataclass(frozen=True)
+class WorkerOptions:
+    """Options of running and watching ranks.
+
+    Attributes:
+        rank_timeout: Seconds without a response to a poll after which a rank counts as lost.
+        preview_folder: Folder of preview images on rank 0's machine; None writes no previews.
+        preview_seconds: Minimum seconds between two previews.
+        actor: Class of the Ray actor that runs a rank; None for `RankProcess`.
+        resume_required: Whether resuming a job fails if no checkpoint can be used.
+        workplace: Workplace for ranks on machines without a shared folder; None for this process's working folder.
+        plan_file: Plan of a dry run, to use if it was made for the same job; None for none.
+        started: Start of the job and of its time budget, in seconds since the epoch; the default is now.
+    """
+
+    rank_timeout: float = RunOptions().rank_timeout
+    checkpoint_seconds: float = RunOptions().checkpoint_seconds
+    preview_folder: Path | None = None
+    preview_seconds: float = 20.0
+    actor: type[RankProcess] | None = None
+    resume_required: bool = True
+    workplace: Workplace | None = None
+    plan_file: Path | None = None
+    started: float = field(default_factory=time.time)
 
 
 @dataclass(frozen=True)
@@ -32,7 +124,7 @@ class Listener:
         stop: Called after each step, or a few times per second; returns True to interrupt the job.
         finish: Called like `stop`; returns True to end the job after a step, with its present colors as the result.
         saved: Called with the step of each checkpoint; not used for ranks.
-        happened: Called with a sentence about each lost or resumed attempt on ranks, and about a long wait for a rank.
+        happened: Called with a sentence about each lost or resumed attempt on ranks.
         stored: Called with the workplace's description of each stored file, in order.
     """
 
@@ -169,3 +261,238 @@ def run_rank(
     return execute(
         job, listener, preview=preview, checkpoint_seconds=options.checkpoint_seconds, run_id=run_id, left=left
     )
+
+
+# --- one of several ranks ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RankPlace:
+    """Location of a rank's process.
+
+    Attributes:
+        node: Ray node ID.
+        address: Address under which other nodes reach the node.
+    """
+
+    node: str
+    address: str
+    host: str
+    process: ProcessId
+
+
+@dataclass(frozen=True)
+class RankTask:
+    """Task of a rank.
+
+    Attributes:
+        rank, size: Number of this rank, and number of ranks.
+        address: Address "host:port" at which rank 0 listens.
+        folder: Base folder of relative paths on every machine; unused with a workplace.
+        workers: Requested ranks and lost attempts, for the report.
+        seconds_lost, seconds_since_loss: Costs of the last lost attempt until this task was created; see
+            `LostAttempt`.
+    """
+
+    request: JobSpec
+    rank: int
+    size: int
+    address: str
+    threads: int
+    options: WorkerOptions
+    folder: Path
+    resume: Resume
+    run_id: str
+    workers: dict[str, Any]
+    seconds_lost: float
+    seconds_since_loss: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of a rank.
+
+    Attributes:
+        result: Result of the job; None if it failed.
+        error: Error with which it failed; None for success.
+        trace: Text of the error's traceback.
+        echo: Whether the error occurred in an exchange between ranks. The root cause may then be the loss of another
+            rank.
+    """
+
+    result: Result | None = None
+    error: Exception | None = None
+    trace: str = ""
+    echo: bool = False
+
+
+@dataclass(frozen=True)
+class RankStatus:
+    """Status of a rank, which it returns when it is polled.
+
+    Attributes:
+        prepared: Summary of the prepared job; set on rank 0 only.
+        progress: Latest progress; None before the first stage. Steps are reported on rank 0 only.
+        saved: Step of the last checkpoint. With a workplace, a checkpoint counts once it is stored.
+        stored: Descriptions of all files that a workplace has stored so far.
+    """
+
+    prepared: Prepared | None = None
+    progress: Progress | None = None
+    saved: int | None = None
+    warnings: tuple[str, ...] = ()
+    stored: tuple[Any, ...] = ()
+    outcome: Outcome | None = None
+
+
+class RankProcess:
+    """Ray actor of a rank. All methods return immediately."""
+
+    def __init__(self) -> None:
+        self._status = RankStatus()
+        self._stop, self._finish = threading.Event(), threading.Event()
+        self._lock = threading.Lock()
+        self._listener: socket.socket | None = None
+        die_with_parent()  # a suspended process would not notice the end of its parent, Ray's daemon
+
+    def place(self) -> RankPlace:
+        """Return the node, host and process ID of this rank."""
+        import ray
+
+        node = ray.get_runtime_context().get_node_id()
+        return RankPlace(node, ray.util.get_node_ip_address(), socket.gethostname(), ProcessId.of_this())
+
+    def listen(self, host: str) -> int:
+        """Open the socket on which rank 0 accepts the other ranks, and return its port.
+
+        Args:
+            host: Address of this machine to bind it to.
+        """
+        self._listener = listen(host)
+        return int(self._listener.getsockname()[1])
+
+    def start(self, task: RankTask) -> None:
+        """Start the job in a thread."""
+        threading.Thread(target=self._run, args=(task,), daemon=True, name="job").start()
+
+    def poll(self) -> RankStatus:
+        """Return the current status. Any response shows the driver that this process is alive."""
+        return self._status
+
+    def stop(self) -> None:
+        """Interrupt the job after the current step. The driver calls this on rank 0 only."""
+        self._stop.set()
+
+    def finish(self) -> None:
+        """End the job after a step, with its present colors as the result. The driver calls this on rank 0 only."""
+        self._finish.set()
+
+    def _update(self, **changes: Any) -> None:
+        with self._lock:
+            self._status = replace(self._status, **changes)
+
+    def _run(self, task: RankTask) -> None:
+        place: OpenWorkplace | None = None
+        try:
+            set_thread_variables(task.threads)
+            import ray
+
+            # If the variable is not set, a process without an assigned GPU sees all GPUs.
+            os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(str(number) for number in ray.get_gpu_ids())
+            if task.options.workplace is not None:
+                place = task.options.workplace.open(task.rank, self._add_stored)
+            elif not task.folder.is_dir():
+                raise InfrastructureError(
+                    f"The folder {task.folder} is not on {socket.gethostname()}. Machines that take part in a job need "
+                    "it under this name, or a service whose files are in an object store."
+                )
+            os.chdir(place.folder if place else task.folder)
+            self._work(task, place)
+        except BaseException as error:
+            if self._status.outcome is None:  # an error after the job is done does not matter
+                self._update(outcome=_failure(error))
+        finally:
+            if place is not None:
+                place.close()
+
+    def _work(self, task: RankTask, place: OpenWorkplace | None) -> None:
+        import torch
+
+        from worker.ranks.process_group import process_group
+
+        torch.set_num_threads(task.threads)
+        device = torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else "cpu"
+        timeout = timedelta(seconds=task.options.rank_timeout + _PATIENCE)
+        with process_group(
+            task.rank, task.size, task.address, device=device, timeout=timeout, listener=self._listener
+        ) as collectives:
+            # The outcome is set before the process group is left, because leaving it may wait for lost ranks.
+            try:
+                result = self._job(task, collectives)
+                if place is not None:
+                    place.finish(done=result.stopped != "interrupted")
+                self._update(outcome=Outcome(result))
+            except BaseException as error:
+                self._update(outcome=_failure(error))
+
+    def _job(self, task: RankTask, collectives: Collectives) -> Result:
+        started, attempts = time.monotonic(), task.workers["attempts"]
+
+        def progress(current: Progress) -> None:
+            latest = self._status.progress
+            if current.is_step and not (latest and latest.is_step) and attempts:
+                since = time.monotonic() - started
+                attempts[-1]["seconds_lost"] = round(task.seconds_lost + since, 3)
+                attempts[-1]["seconds_to_resume"] = round(task.seconds_since_loss + since, 3)
+            self._update(progress=current)
+
+        listener = Listener(
+            prepared=lambda prepared: self._update(prepared=prepared),
+            progress=progress,
+            warn=lambda line: self._update(warnings=(*self._status.warnings, line)),
+            stop=self._stop.is_set,
+            finish=self._finish.is_set,
+            saved=lambda step: self._update(saved=step) if task.options.workplace is None else None,
+        )
+        return run_rank(
+            task.request,
+            listener,
+            task.options,
+            task.resume,
+            collectives=collectives,
+            run_id=task.run_id,
+            about_ranks=task.workers,
+        )
+
+    def _add_stored(self, file: Any, step: int | None) -> None:
+        with self._lock:
+            saved = self._status.saved if step is None else step
+            self._status = replace(self._status, stored=(*self._status.stored, file), saved=saved)
+
+
+def set_thread_variables(threads: int) -> None:
+    """Set the number of threads for libraries that have not been imported yet.
+
+    Numba reads its variable again whenever it compiles, and raises an error if the value differs from that at its
+    import. Once Numba is imported, only `compiled.kernel_threads` sets its number of threads.
+    """
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
+    if "numba" not in sys.modules:
+        os.environ["NUMBA_NUM_THREADS"] = str(threads)
+
+
+def _failure(error: BaseException) -> Outcome:
+    trace = "".join(traceback.format_exception(error))
+    sent = error if isinstance(error, Exception) else RuntimeError(repr(error))
+    try:
+        pickle.loads(pickle.dumps(sent))
+    except Exception:  # the error cannot be pickled, so only its text is sent
+        sent = RuntimeError(f"{type(error).__name__}: {error}")
+    return Outcome(error=sent, trace=trace, echo=_raised_in_exchange(error))
+
+
+def _raised_in_exchange(error: BaseException) -> bool:
+    """Return whether an error was raised inside torch.distributed, including its store."""
+    frames = [frame.f_globals.get("__name__") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return any(str(name).startswith("torch.distributed") for name in (type(error).__module__, *frames))

@@ -25,7 +25,7 @@ from sgsst_core.files.formats import SUFFIXES, scene_path
 from sgsst_core.settings import declared
 from worker.job import JobSpec, Outputs, check_is_not_input
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
-from worker.ranks.rank import WorkerOptions
+from worker.run import WorkerOptions
 
 if TYPE_CHECKING:
     from torch import Tensor

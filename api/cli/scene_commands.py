@@ -387,8 +387,7 @@ def paint(
 ) -> None:
     """Paint one view or several, and the scene follows."""
     from worker.painting import export_view, run_painting
-    from worker.ranks.rank import WorkerOptions
-    from worker.run import Listener
+    from worker.run import Listener, WorkerOptions
 
     if bool(view) == (export is not None):
         raise SettingsError("Give --export NAME to write an image, or --view NAME=FILE with a painted one.")

@@ -34,7 +34,7 @@ from sgsst_core.stylizing.progress_bar import job_bar
 from worker.job import JobSpec, Outputs, Result, check_request
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 from worker.processes import STOP_SIGNALS
-from worker.ranks.rank import WorkerOptions
+from worker.run import WorkerOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
     from worker.prepare import Prepared

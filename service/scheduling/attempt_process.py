@@ -53,8 +53,7 @@ def run(task: Task) -> None:
 
 
 def _stylize(task: Task, stopping: threading.Event, finishing: threading.Event) -> Result | None:
-    from worker.ranks.rank import WorkerOptions
-    from worker.run import Listener, stylize
+    from worker.run import Listener, WorkerOptions, stylize
 
     listener = Listener(
         prepared=report_prepared,

@@ -18,7 +18,7 @@ from service.states import AttemptOutcome, Cause, Published
 from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
 from sgsst_core.progress import Progress
 from worker.job import JobSpec, Result, scene_bytes
-from worker.ranks.rank import Stored
+from worker.run import Stored
 
 if TYPE_CHECKING:
     from service.scheduling.rank_folder import RankFolder

@@ -35,7 +35,7 @@ from service.store.tables import ArtifactRow
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.atomic import file_digest
-from worker.ranks.rank import Stored
+from worker.run import Stored
 
 #: Interval between checks for new files to upload, in seconds.
 _SCAN_SECONDS = 0.5

@@ -46,7 +46,7 @@ def _variables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_DISPLAY_ENV", "VERBOSE")
 
 
-@pytest.mark.parametrize("module", ["sgsst_core", pytest.param("worker.ranks.rank", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("module", ["sgsst_core", pytest.param("worker.run", marks=pytest.mark.slow)])
 def test_waiting_threads_spin_briefly(module: str) -> None:
     assert spin_count(module) == "1000"
 

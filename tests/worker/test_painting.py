@@ -20,8 +20,7 @@ from tests.small_scenes import wall
 from worker.job import JobSpec, SceneRequest
 from worker.options import PaintedFile
 from worker.painting import run_painting
-from worker.ranks.rank import WorkerOptions
-from worker.run import Listener
+from worker.run import Listener, WorkerOptions
 
 OPTIONS = ("--orbit", "6", "--resolution", "96")
 

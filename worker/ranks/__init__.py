@@ -1,3 +1,3 @@
 """One job on several ranks, which Ray starts as processes: `driver` watches them, `cluster` is Ray and what it
-reserves, `rank` is the process of a rank, and `process_group` exchanges tensors between ranks.
+reserves, and `process_group` exchanges tensors between ranks. `worker.run` has the process of a rank.
 """

@@ -24,8 +24,17 @@ from sgsst_core.progress import Progress
 from worker.job import JobSpec, Result, Resume, scene_bytes
 from worker.processes import ProcessId, home, kill
 from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, first_line, reserve
-from worker.ranks.rank import RankPlace, RankProcess, RankStatus, RankTask, WorkerOptions, Workplace
-from worker.run import Ended, Listener, LostAttempt
+from worker.run import (
+    Ended,
+    Listener,
+    LostAttempt,
+    RankPlace,
+    RankProcess,
+    RankStatus,
+    RankTask,
+    WorkerOptions,
+    Workplace,
+)
 
 #: Seconds that an interrupted job has to finish its step and save a checkpoint.
 STOP_SECONDS = 10.0

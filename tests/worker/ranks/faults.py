@@ -18,7 +18,7 @@ from tests.full_disk import full_disk
 from tests.small_scenes import wall, write_files
 from worker.job import JobSpec, SceneRequest
 from worker.options import StyleFile
-from worker.ranks.rank import OpenWorkplace, RankProcess, RankTask
+from worker.run import OpenWorkplace, RankProcess, RankTask
 
 Place = Literal["all_reduce", "checkpoint", "render"]
 

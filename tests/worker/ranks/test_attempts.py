@@ -22,8 +22,7 @@ from worker.job import JobSpec
 from worker.prepare import Prepared, prepare
 from worker.ranks.cluster import Cluster
 from worker.ranks.driver import stylize_on_ranks
-from worker.ranks.rank import WorkerOptions
-from worker.run import Ended, Listener
+from worker.run import Ended, Listener, WorkerOptions
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread", "vgg16_weights"),

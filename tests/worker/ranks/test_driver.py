@@ -17,8 +17,7 @@ from worker.prepare import Prepared
 from worker.processes import home
 from worker.ranks.cluster import Cluster, NoCapacityError, reserve
 from worker.ranks.driver import MOST_ATTEMPTS, AttemptFailedError, Relay, check_retry, failure_of
-from worker.ranks.rank import RankStatus
-from worker.run import Listener, LostAttempt
+from worker.run import Listener, LostAttempt, RankStatus
 
 KILLED = AttemptFailedError("loss", "Worker 1 on here was lost: its process was killed")
 

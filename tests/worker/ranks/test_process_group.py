@@ -40,7 +40,7 @@ from tests.worker.ranks.spawn import on_ranks
 from worker.inputs import Capture
 from worker.job import Outputs
 from worker.ranks.process_group import _backend, _meet
-from worker.ranks.rank import _failure
+from worker.run import _failure
 
 HEIGHT = 70
 ROOT = Path(__file__).resolve().parents[3]
@@ -49,7 +49,7 @@ ROOT = Path(__file__).resolve().parents[3]
 COLD_CACHE = """
 import os, sys
 import numba, numpy as np
-from worker.ranks.rank import set_thread_variables
+from worker.run import set_thread_variables
 
 @numba.njit(parallel=True)
 def doubled(x):
@@ -325,7 +325,7 @@ def message(value: Any) -> Tensor:
         {"error": ["sgsst_core.messages:import_module", ["antigravity"]]},
         {"error": ["worker.processes:kill", [[]]]},
         {"object": ["pathlib:Path", {}]},
-        {"object": ["worker.ranks.rank:RankProcess", {}]},
+        {"object": ["worker.run:RankProcess", {}]},
         {"object": ["sgsst_core.planning.plan:Decision", {"__class__": 1}]},
         {"object": ["sgsst_core.planning.plan:Decision.__init__", {}]},
         {"call": ["os.system", "true"]},
