@@ -14,7 +14,6 @@ PROGRAMS = (
     "service.scheduling.dispatcher",
     "torch.distributed",
     "worker.execute",
-    "worker.prepare",
     "worker.ranks.driver",
 )
 

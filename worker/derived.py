@@ -54,6 +54,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
+from worker.execute import describe_scene
 from worker.inputs import (
     Capture,
     about_notes,
@@ -68,7 +69,6 @@ from worker.inputs import (
 )
 from worker.job import JobSpec, SceneRequest, check_choice, check_folder, check_is_not_input, result_format
 from worker.options import DEFAULT_SIDE, MOST_VIEWPOINT_NAME, VideoOptions, Viewpoint, Viewpoints
-from worker.prepare import describe_scene
 
 #: Number of views of an orbit that a converted scene is compared in.
 _COMPARED_VIEWS = 3

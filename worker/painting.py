@@ -26,6 +26,7 @@ from sgsst_core.rasterizer.base import Color, Rasterizer
 from sgsst_core.report.document import PLAN_VERSION, REPORT_VERSION
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.spherical_harmonics import scene_colors
+from worker.execute import THUMBNAIL_SIDE, Prepared, describe_scene, save_thumbnail
 from worker.inputs import (
     STYLE_PIXELS,
     Capture,
@@ -39,7 +40,6 @@ from worker.inputs import (
 )
 from worker.job import JobSpec, Outputs, Result, SceneRequest, check_choice, check_request, check_suffix
 from worker.options import CameraParameters, PaintedFile, PaintedOptions
-from worker.prepare import THUMBNAIL_SIDE, Prepared, describe_scene, save_thumbnail
 from worker.run import Listener, WorkerOptions
 
 #: Text chunk of a PNG with the view that it shows, as `PaintedOptions`.

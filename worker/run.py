@@ -30,7 +30,7 @@ from worker.processes import ProcessId, die_with_parent, listen
 
 if TYPE_CHECKING:
     from sgsst_core.parallel.collectives import Collectives
-    from worker.prepare import Prepared
+    from worker.execute import Prepared
 
 #: Seconds by which the timeout of an exchange between ranks exceeds the driver's. The driver should time out first,
 #: because it knows which rank does not respond.
@@ -231,8 +231,7 @@ def run_rank(
     from sgsst_core import container
     from sgsst_core.devices import seconds_left
     from sgsst_core.parallel.collectives import ALONE
-    from worker.execute import execute
-    from worker.prepare import Previews, describe, prepare
+    from worker.execute import Previews, describe, execute, prepare
 
     gc.enable()
 

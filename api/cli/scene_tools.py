@@ -35,11 +35,11 @@ from sgsst_core.scene.camera import Camera, faces_to_render, join_faces, level, 
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.style import STARRY_NIGHT
 from worker.derived import blend
+from worker.execute import dry_run
 from worker.inputs import check_something_seen, orbit_request, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice, check_is_not_input, check_suffix
 from worker.options import ViewOptions, split_weight
 from worker.painting import camera_named
-from worker.prepare import dry_run
 
 if TYPE_CHECKING:  # it imports matplotlib, for which the other commands need not wait
     from sgsst_core.bench.variants import Curve, Quality

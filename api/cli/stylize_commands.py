@@ -37,7 +37,7 @@ from worker.processes import STOP_SIGNALS
 from worker.run import WorkerOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
-    from worker.prepare import Prepared
+    from worker.execute import Prepared
     from worker.run import Ended
 
 #: Resolution and number of steps of the demo, and its time budget, which ends the steps on a slow machine. The whole

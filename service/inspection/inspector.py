@@ -398,7 +398,7 @@ def stored_plan(
 ) -> Path:
     """Return the path of the plan of an owner's last dry run for these inputs on this machine; it may not exist.
 
-    The plan was written by a process that reads users' files: `worker.prepare` decides whether a job uses it.
+    The plan was written by a process that reads users' files: `worker.execute` decides whether a job uses it.
     """
     _, _, key = _key(settings, "plan", owner, inputs, parameters).partition(":")
     return settings.folder / "plans" / f"{key}.safetensors"

@@ -54,11 +54,11 @@ from sgsst_core.style import STARRY_NIGHT
 from sgsst_core.stylizing.checkpoint import versions
 from sgsst_core.stylizing.planner import estimate
 from worker.derived import VideoRequest, blend, convert, render_video, write_page, write_poster
+from worker.execute import dry_run
 from worker.inputs import Inputs, choose_axes, cropped, errors_of, orbit_request, read_inputs, read_job_capture
 from worker.job import SceneRequest, check_steps
 from worker.options import JobVideo, Viewpoint, Viewpoints
 from worker.painting import PaintInputs, read_paintings
-from worker.prepare import dry_run
 from worker.processes import die_with_parent, process_start
 
 with contextlib.suppress(ImportError):

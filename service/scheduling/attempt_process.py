@@ -24,8 +24,8 @@ from sgsst_core.progress import Progress
 from worker.processes import die_with_parent, process_start
 
 if TYPE_CHECKING:
+    from worker.execute import Prepared
     from worker.job import Result
-    from worker.prepare import Prepared
 
 #: Niceness of CPU jobs, which use all cores: the API takes precedence if it runs on the same machine.
 _NICENESS = 5

@@ -24,11 +24,10 @@ from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall, write_files
-from worker.execute import execute
+from worker.execute import Job, dry_run, execute, prepare
 from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume, SceneRequest
 from worker.options import StyleFile, region_options, region_requests
-from worker.prepare import Job, dry_run, prepare
 from worker.run import Listener
 
 if torch.cuda.is_available():

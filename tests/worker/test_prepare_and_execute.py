@@ -22,11 +22,10 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.faults import Fault, small_request
-from worker import prepare as previews_module
-from worker.execute import execute
+from worker import execute as previews_module
+from worker.execute import Job, Previews, dry_run, execute, prepare
 from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume
-from worker.prepare import Job, Previews, dry_run, prepare
 from worker.run import Listener
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")

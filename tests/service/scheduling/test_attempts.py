@@ -34,8 +34,8 @@ from sgsst_core.errors import (
     WeightsError,
 )
 from sgsst_core.progress import Progress
+from worker.execute import Prepared
 from worker.job import Result
-from worker.prepare import Prepared
 
 DONE = Ending(AttemptOutcome.SUCCEEDED, Result(stopped="finished", steps=3, total=3))
 ERROR = {"code": "diverged", "message": "The loss is not finite."}

@@ -17,9 +17,8 @@ from PIL import Image
 from sgsst_core.progress import Progress
 from tests.api.service import PATIENCE, wait_for
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, name_of, shared_memory, small_request
-from worker.execute import execute
+from worker.execute import Prepared, execute, prepare
 from worker.job import JobSpec
-from worker.prepare import Prepared, prepare
 from worker.ranks.cluster import Cluster
 from worker.ranks.driver import stylize_on_ranks
 from worker.run import Ended, Listener, WorkerOptions

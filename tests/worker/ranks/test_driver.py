@@ -12,8 +12,8 @@ import pytest
 
 from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedError, SceneError
 from sgsst_core.progress import Progress
+from worker.execute import Prepared
 from worker.job import memory_beside_gpus, scene_bytes
-from worker.prepare import Prepared
 from worker.processes import home
 from worker.ranks.cluster import Cluster, NoCapacityError, reserve
 from worker.ranks.driver import MOST_ATTEMPTS, AttemptFailedError, Relay, check_retry, failure_of
