@@ -538,22 +538,19 @@ def check_memory(path: Path, collectives: Collectives, growth: float = 1.0) -> N
     count = int(header.count * growth)
     scene_bytes = int(header.count * 4 * (14 + 3 * header.coefficients) * growth)
     own = count * (OPTIMIZER_BYTES + VIEW_BYTES)
-    where = f"Rank {collectives.rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
-    advice = "Give a machine with more memory, fewer --workers on each, or a smaller scene."
     # Every rank has the scene, and a copy of the Gaussians that its views show.
-    needed, free = collectives.local_size * (2 * scene_bytes + own), container.memory().available
-    if needed > free:
-        raise SceneTooLargeError(
-            f"{where} {needed / 1e9:.2f} GB of memory (ranks there: {collectives.local_size}), but {free / 1e9:.2f} GB "
-            f"are free. {advice}"
-        )
+    ranks = collectives.local_size
+    needs = [
+        (f"of memory (ranks on this machine: {ranks})", ranks * (2 * scene_bytes + own), container.memory().available)
+    ]
     if torch.cuda.is_available():
-        free, total = torch.cuda.mem_get_info()
-        needed = scene_bytes + own
+        needs.append((f"on its GPU ({torch.cuda.get_device_name()})", scene_bytes + own, torch.cuda.mem_get_info()[0]))
+    for where, needed, free in needs:
         if needed > free:
             raise SceneTooLargeError(
-                f"{where} {needed / 1e9:.2f} GB on its GPU ({torch.cuda.get_device_name()}, {total / 1e9:.1f} GB), but "
-                f"{free / 1e9:.2f} GB are free. {advice}"
+                f"Rank {collectives.rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need "
+                f"{needed / 1e9:.2f} GB {where}, but {free / 1e9:.2f} GB are free. Give a machine with more memory, "
+                "fewer --workers on each, or a smaller scene."
             )
 
 
@@ -605,9 +602,7 @@ class Capture:
         used = [index for index, photo in enumerate(matches) if photo is not None]
         photos = [photo for photo in matches if photo is not None]
         cameras = [undistorted(self.cameras[index]) for index in used]
-        width = min((new.width / self.cameras[i].width for new, i in zip(cameras, used, strict=True)), default=1.0)
-        size = f"at least {width:.0%} of their width, as much as their photos fill" if width < 1 else "their size"
-        lines = _about_lenses(cameras, "the photos are undistorted", f"views keep {size}")
+        lines = _about_lenses(cameras, "the photos are undistorted", "views keep what their photos fill")
         lines += _about_photos(cameras, photos, missing)
         if strangers := PhotoFolder(folder).strangers(self.names):
             reason = f"they have the name of no camera: {some_names(strangers)}"
@@ -745,7 +740,7 @@ def _about_lenses(cameras: Sequence[Camera], decision: str, reason: str) -> list
 
 
 def _about_photos(cameras: Sequence[Camera], photos: Sequence[Photo], missing: Sequence[str]) -> list[Decision]:
-    """Return the decisions about missing, ambiguous and rotated photos."""
+    """Return the decisions about missing and ambiguous photos."""
     lines = []
     if missing:
         left_out = f"warning: {len(missing)} of {len(missing) + len(photos)} views are left out"
@@ -755,8 +750,4 @@ def _about_photos(cameras: Sequence[Camera], photos: Sequence[Photo], missing: S
     if shared:
         text = f"warning: {len(shared)} belong to several cameras each, of which they can show one"
         lines.append(Decision("photos", text, f"the names of these cameras are the same: {some_names(shared)}"))
-    oriented = [photo for photo in photos if photo.oriented]
-    if oriented:
-        reason = f"without it they do not have the shapes of their cameras, such as {oriented[0].path.name}"
-        lines.append(Decision("photos", f"the EXIF orientation of {len(oriented)} is applied", reason))
     return lines

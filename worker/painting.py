@@ -235,12 +235,8 @@ def _stated(path: Path) -> PaintedOptions | None:
         return None
 
 
-class _InterruptedError(Exception):
-    """Interruption of a job on request."""
-
-
 def run_painting(request: JobSpec, listener: Listener, options: WorkerOptions) -> Result:
-    """Run a job with painted views in this process. It takes seconds, so there are no checkpoints.
+    """Run a job with painted views in this process. It takes seconds, so it is neither interrupted nor resumed.
 
     It writes the scene and, beside it, report, plan and colors.
 
@@ -250,26 +246,19 @@ def run_painting(request: JobSpec, listener: Listener, options: WorkerOptions) -
     started = time.perf_counter()
     check_request(request)
     inputs = read_paintings(request)
-    file, now = inputs.scene_file, Progress(stage="painting", total=PASSES)
+    file = inputs.scene_file
     lines = [(line.item, f"{line.decision}: {line.reason}") for line in inputs.decisions]
     listener.prepared(Prepared([("scene", describe_scene(file)), *lines], 0, PASSES))
     begun = time.perf_counter()
 
     def show(done: int) -> None:
-        nonlocal now
         left = (time.perf_counter() - begun) / done * (PASSES - done) if done else inputs.seconds
-        now = Progress(stage="painting", step=done, total=PASSES, eta_s=left)
-        listener.progress(now)
-        if listener.stop():
-            raise _InterruptedError
+        listener.progress(Progress(stage="painting", step=done, total=PASSES, eta_s=left))
 
     rasterizer = make_rasterizer("cpu", file.scene, background=request.settings.background, near=request.source.near)
     side = max(camera.side for camera in inputs.cameras)  # their pixels are compared with those of the painted views
     others = [resized(camera, side) for camera in spread(inputs.capture.cameras, _OTHERS)]
-    try:
-        painted = paint(file.scene, inputs.views, rasterizer, others=others, show=show)
-    except _InterruptedError:
-        return Result(stopped="interrupted", steps=now.step, total=PASSES)
+    painted = paint(file.scene, inputs.views, rasterizer, others=others, show=show)
     if options.preview_folder:
         camera = inputs.cameras[0]
         camera = resized(camera, min(camera.side, THUMBNAIL_SIDE))

@@ -145,7 +145,7 @@ def sweep(folder: Path) -> None:
     A process uses the folder if it has a file of the folder open, or if its command line contains the folder's path.
     """
     started = time.monotonic()
-    while users := _users(folder):
+    while users := [each for each in psutil.process_iter() if each.pid != os.getpid() and _uses(each, str(folder))]:
         if time.monotonic() - started > _LIMIT:
             break
         if time.monotonic() - started > _PATIENCE:
@@ -156,12 +156,8 @@ def sweep(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _users(folder: Path) -> list[psutil.Process]:
-    """Return the other processes of this user that use a folder."""
-    return [process for process in psutil.process_iter() if process.pid != os.getpid() and _uses(process, str(folder))]
-
-
 def _uses(process: psutil.Process, folder: str) -> bool:
+    """Return whether a process of this user uses a folder."""
     try:
         command = " ".join(process.cmdline())
         if folder in command:

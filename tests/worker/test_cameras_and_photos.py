@@ -102,18 +102,6 @@ def test_photos_may_have_another_size_and_missing_ones_are_reported(tmp_path: Pa
         capture.with_photos(photos)
 
 
-def test_photos_that_only_fit_rotated_are_reported(tmp_path: Path) -> None:
-    capture = read_capture(request(tmp_path), SCENE)
-    photos = write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2"])
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("RGB", (48, 64)).save(photos / "view_1.png", exif=exif)
-    assert lines(capture.with_photos(photos)) == [
-        "photos: the EXIF orientation of 1 is applied: without it they do not have the shapes of their cameras, such "
-        "as view_1.png"
-    ]
-
-
 def test_distortion_is_ignored_without_photos_and_removed_from_them(tmp_path: Path) -> None:
     source = request(tmp_path).model_copy(update={"cameras": distorted(tmp_path / "transforms.json", 2, k1=0.2)})
     capture = read_capture(source, SCENE)

@@ -13,14 +13,7 @@ from PIL.PngImagePlugin import PngInfo
 from api.cli.console import BAD_INPUT
 from api.cli.main import main
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.painting.solver import PASSES
-from sgsst_core.progress import Progress
-from sgsst_core.settings import make_settings
 from tests.small_scenes import wall
-from worker.job import JobSpec, SceneRequest
-from worker.options import PaintedFile
-from worker.painting import run_painting
-from worker.run import Listener, WorkerOptions
 
 OPTIONS = ("--orbit", "6", "--resolution", "96")
 
@@ -108,21 +101,6 @@ def test_hostile_text_chunk_is_ignored(folder: Path, capsys: pytest.CaptureFixtu
         image.save(folder / "hostile.png", pnginfo=metadata)
     assert command(folder, "--view", str(folder / "hostile.png")) == BAD_INPUT
     assert "does not state its view" in " ".join(capsys.readouterr().err.split())
-
-
-def test_interrupted_job_writes_nothing(folder: Path, tmp_path: Path) -> None:
-    request = JobSpec(
-        source=SceneRequest(scene=folder / "scene.ply"),
-        styles=(),
-        out=tmp_path / "painted.ply",
-        settings=make_settings(),
-        paintings=(PaintedFile(folder / "view.png"),),
-    )
-    reported: list[Progress] = []
-    listener = Listener(progress=reported.append, stop=lambda: reported[-1].step == 3)
-    result = run_painting(request, listener, WorkerOptions())
-    assert (result.stopped, result.steps, result.total) == ("interrupted", 3, PASSES)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_picture_of_another_view_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -288,14 +288,13 @@ class RankHandle:
     Attributes:
         place: Location of the rank's process; None until the rank has reported it.
         pending_poll: Ray reference to the response to a pending poll; None if no poll is pending.
-        polled_at, answered_at: Times of the last poll and the last response, in monotonic seconds.
+        answered_at: Time of the last response, in monotonic seconds.
         status: Latest status that the rank has returned.
     """
 
     actor: Any
     place: RankPlace | None = None
     pending_poll: Any = None
-    polled_at: float = 0.0
     answered_at: float = field(default_factory=time.monotonic)
     status: RankStatus = field(default_factory=RankStatus)
 
@@ -368,8 +367,8 @@ def start_ranks(group: RankGroup, workers: int, scene: int, actor: type[RankProc
         rank.answered_at = time.monotonic()
 
 
-#: Seconds between two polls of a rank.
-POLL_SECONDS = 0.25
+#: Seconds before each poll of the ranks, and seconds to wait for their responses.
+POLL_SECONDS = 0.1
 #: Seconds to wait for a response that Ray reports as ready.
 _FETCH_SECONDS = 60.0
 #: Reason of a rank's death with its machine.
@@ -386,14 +385,11 @@ def poll_ranks(group: RankGroup) -> None:
     """
     import ray
 
-    now = time.monotonic()
+    time.sleep(POLL_SECONDS)
     for rank in group.handles:
-        if rank.pending_poll is None and now - rank.polled_at >= POLL_SECONDS:
-            rank.pending_poll, rank.polled_at = rank.actor.poll.remote(), now
-    polls = {rank.pending_poll: rank for rank in group.handles if rank.pending_poll is not None}
-    if not polls:
-        time.sleep(POLL_SECONDS / 4)
-        return
+        if rank.pending_poll is None:
+            rank.pending_poll = rank.actor.poll.remote()
+    polls = {rank.pending_poll: rank for rank in group.handles}
     ready, _ = ray.wait(list(polls), num_returns=len(polls), timeout=POLL_SECONDS)
     for poll in ready:
         rank = polls[poll]

@@ -67,15 +67,11 @@ def process_group(
     if device.type == "cuda":
         torch.cuda.set_device(device)
     backend = _backend(device, sharing)
-    dist.init_process_group(
-        backend, store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device, backend)
-    )
-    # Subgroups get connections of their own, which ranks that are left out do not close. With a bound device, they
-    # would be split off from those of this group.
-    world: Any = dist.group.WORLD
-    world.bound_device_id = None
+    # No device is bound to the group, so that subgroups get connections of their own, rather than those of this group,
+    # which ranks that are left out could close.
+    dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=patience)
     try:
-        yield ProcessGroupCollectives(world, device, timeout, sharing)
+        yield ProcessGroupCollectives(dist.group.WORLD, device, timeout, sharing)
     finally:
         dist.destroy_process_group()
 
@@ -134,14 +130,6 @@ def _backend(device: torch.device, sharing: int) -> str:
     return "cpu:gloo,cuda:nccl" if device.type == "cuda" and sharing == 1 and dist.is_nccl_available() else "gloo"
 
 
-def _named(device: torch.device, backend: str) -> torch.device | None:
-    """Return the device to bind a group to; None for gloo, which does not accept a device.
-
-    With a bound device, NCCL connects at once rather than in the first exchange.
-    """
-    return device if "nccl" in backend else None
-
-
 def _stacked(parts: Sequence[LayerStatistics]) -> LayerStatistics:
     """Stack statistics of the same number of channels: count [k, 1], mean [k, c], centered [k, c, c]."""
     counts, means, moments = zip(*((part.count[None], part.mean, part.centered) for part in parts), strict=True)
@@ -170,7 +158,6 @@ class ProcessGroupCollectives(Collectives):
         self._group = group
         self._device = device
         self.gpu_sharing = gpu_sharing
-        self._named = _named(device, _backend(device, gpu_sharing))
         self._timeout = timeout
         self.sent: dict[Traffic, int] = dict.fromkeys(TRAFFIC, 0) if sent is None else sent
         self._halves: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
@@ -225,15 +212,12 @@ class ProcessGroupCollectives(Collectives):
             for source, target in zip(sent, received, strict=True):
                 yield target[rank], source[rank] if rank == self.rank else next(values).view_as(target[rank])
 
-    def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
-        """See `Collectives`."""
-        return self._reduce(tensor, traffic)
-
     def union(self, mask: Tensor) -> Tensor:
         """See `Collectives`."""
-        return self._reduce(mask.to(torch.uint8), "gradient", dist.ReduceOp.MAX).bool()
+        return self.all_reduce(mask.to(torch.uint8), operation=dist.ReduceOp.MAX).bool()
 
-    def _reduce(self, tensor: Tensor, traffic: Traffic, operation: Any = dist.ReduceOp.SUM) -> Tensor:
+    def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient", operation: Any = dist.ReduceOp.SUM) -> Tensor:
+        """See `Collectives`. The operation is that of torch.distributed."""
         tensor = tensor.contiguous()
         self.sent[traffic] += 2 * (self.size - 1) * tensor.nbytes // self.size
         dist.all_reduce(tensor, operation, group=self._group)
@@ -338,7 +322,7 @@ class ProcessGroupCollectives(Collectives):
             return self
         if len(ranks) == 1:
             return ALONE if self.rank in ranks else None
-        group = dist.new_group(list(ranks), timeout=max(self._timeout, PREPARING), device_id=self._named)
+        group = dist.new_group(list(ranks), timeout=max(self._timeout, PREPARING))
         if self.rank not in ranks:
             return None
         return ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing, self.sent)
