@@ -250,11 +250,17 @@ def write_page(
     upright = up or _mean_up(cameras) or find_upright_subject(shown.scene, None)[1].direction.tolist()
     chosen = viewpoints or Viewpoints()
     start = chosen.start or (viewpoint_of(cameras[0]) if cameras else None)
-    opening = Viewpoints(start=start, named=chosen.named).model_dump(mode="json")
     sizes = {name: len(content) for name, content in data.items()}
     sog = shown.format in (SOG.name, STREAMED_SOG.name)
-    facts = {"title": title, "up": upright, "fade": fade, "sog": sog, "background": background, "bytes": sizes}
-    facts["viewpoints"] = opening
+    facts = {
+        "title": title,
+        "up": upright,
+        "fade": fade,
+        "sog": sog,
+        "background": background,
+        "bytes": sizes,
+        "viewpoints": Viewpoints(start=start, named=chosen.named).model_dump(mode="json"),
+    }
     about = json.dumps(facts).replace("<", "\\u003c")
     values = {"title": html.escape(title), "style": viewer["style"], "about": about}
     values |= {name: _base85(content) for name, content in data.items()}

@@ -57,8 +57,7 @@ from sgsst_core.stylizing.steps import Evaluation, mean_loss, on_scales_of, roun
 from sgsst_core.stylizing.stylizer import Stylizer, render_first_view, transferred_colors
 from worker.inputs import Inputs, fingerprint_of, read_inputs, same_weights, together
 from worker.job import CONTINUABLE, JobSpec, Outputs, Result, Resume, check_request
-from worker.options import RunOptions
-from worker.run import Listener
+from worker.run import Listener, WorkerOptions
 
 Warn = Callable[[str], None]
 
@@ -153,7 +152,6 @@ def prepare(
     plan = known if known and collectives.size <= known_ranks and _is_usable(known, collectives) else None
     if known and not plan and known.device == common_device(collectives):
         asked = asked.model_copy(update={"precision": known.precision})  # a job has one precision
-    planned_ranks = known_ranks if plan else collectives.size
     of_job = _job_inputs(inputs, asked, weights, chosen).refined(refinement, scene_file.scene)
     stylization = plan_job(
         replace(of_job, photos=inputs.photo_loader(settings.background)),
@@ -167,11 +165,11 @@ def prepare(
     with timer("preparing"):
         stylizer = Stylizer(stylization)
     stylizer.seconds_by_part.update(({"start": start} if start else {}) | timer.seconds)
-    source, images = request.source, request.images
-    styles = tuple(file.path for file in request.styles)
-    sources = Sources(source.scene, scene_file.dropped, styles, source.cameras, images, weights)
+    source, styles = request.source, tuple(file.path for file in request.styles)
+    sources = Sources(source.scene, scene_file.dropped, styles, source.cameras, request.images, weights)
     workers = {"requested": collectives.size, **_workers_used(stylizer), "attempts": []}
-    return Job(request, outputs, scene_file, sources, stylizer, fingerprint, resumed, planned_ranks, workers, started)
+    ranks = known_ranks if plan else collectives.size
+    return Job(request, outputs, scene_file, sources, stylizer, fingerprint, resumed, ranks, workers, started)
 
 
 def dry_run(
@@ -308,9 +306,9 @@ def describe(job: Job) -> Prepared:
         lines.append(("resuming", f"at step {job.resumed.state.step} of {stylizer.job.total_steps}"))
     elif job.outputs.checkpoint.exists():
         note = (
-            f"{job.outputs.checkpoint} exists from an earlier run. This run starts from the beginning and replaces it; "
+            "exists from an earlier run. This run starts from the beginning and replaces it; use --resume to continue"
         )
-        lines.append(("note", note + "use --resume to continue from it."))
+        lines.append(("note", f"{job.outputs.checkpoint} {note} from it."))
     return Prepared(lines, job.resumed.state.step if job.resumed else 0, stylizer.job.total_steps)
 
 
@@ -326,12 +324,11 @@ def _describe_views(job: Job) -> str:
     views = job.stylizer.job.views
     sizes = sorted({(camera.width, camera.height) for camera in views.cameras})
     ends = dict.fromkeys(f"{width}x{height}" for width, height in (sizes[0], sizes[-1]))
-    text = f"{len(views)} of {' to '.join(ends)}"
     tiling = job.stylizer.job.loss.tiling
-    scales = max(tiling.scale_count((height, width)) for width, height in sizes)
-    chosen = max(len(tiling.scales((height, width))) for width, height in sizes)
-    text += f", {f'{chosen} of ' if chosen < scales else ''}{scales} scale{'s' if scales > 1 else ''}"
-    return text + f"; content from {'the photos' if job.request.images else 'unstylized renders'}"
+    scales = max(len(tiling.scales((height, width))) for width, height in sizes)
+    content = "the photos" if job.request.images else "unstylized renders"
+    plural = "s" if scales > 1 else ""
+    return f"{len(views)} of {' to '.join(ends)}, {scales} scale{plural}; content from {content}"
 
 
 def _describe_network(job: Job) -> str:
@@ -343,16 +340,13 @@ def _describe_network(job: Job) -> str:
 
 # --- steps and outputs ------------------------------------------------------------------------------------------------
 
-#: Default seconds between checkpoints. If a rank is lost, at most this much work is repeated.
-CHECKPOINT_SECONDS = RunOptions().checkpoint_seconds
-
 
 def execute(
     job: Job,
     listener: Listener,
     *,
     preview: Previews | None = None,
-    checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    checkpoint_seconds: float = WorkerOptions.checkpoint_seconds,
     run_id: str | None = None,
     left: SecondsLeft | None = None,
 ) -> Result:

@@ -303,12 +303,11 @@ def load_styles(files: Sequence[StyleFile], background: Color = WHITE) -> Style:
         SettingsError: If there are too many images, or if the weights cannot be normalized.
     """
     weights = normalized([file.weight for file in files])  # raises before any image is read
-    names = tuple(file.path.name for file in files)
     sizes = [math.prod(image_size(file.path)) for file in files]
     most = STYLE_PIXELS // len(files) if sum(sizes) > STYLE_PIXELS else STYLE_PIXELS
     notes = [_REDUCED.format(file.path.name) for file, size in zip(files, sizes, strict=True) if size > most]
     images = tuple(load_image(file.path, background=background, warn=notes.append, max_pixels=most) for file in files)
-    return Style(images, weights, names, tuple(notes))
+    return Style(images, weights, tuple(file.path.name for file in files), tuple(notes))
 
 
 def _capture_on_all_ranks(request: JobSpec, file: SceneFile, collectives: Collectives) -> Capture:

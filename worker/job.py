@@ -326,17 +326,16 @@ def check_request(request: JobSpec) -> Outputs:
     out = request.out
     check_file(out)
     outputs = Outputs.of(out)
-    written = outputs.all
     if request.paintings:
         result_format(out)  # which a streamed SOG has not
-        written = [out, outputs.report, outputs.plan, outputs.colors]
     else:
         check_steps(request.settings)
+    written = [out, outputs.report, outputs.plan, outputs.colors] if request.paintings else outputs.all
     inputs = {request.source.scene: "scene itself"}
     if request.source.cameras is not None:
         inputs[request.source.cameras] = "camera file"
-    styles = (*request.styles, *(style for region in request.regions for style in region.styles))
-    inputs |= {style.path: "style image" for style in styles}
+    every = (request.styles, *(region.styles for region in request.regions))
+    inputs |= {style.path: "style image" for styles in every for style in styles}
     inputs |= {painting.path: "painted image" for painting in request.paintings}
     for path in written:
         remark = "" if path == out else f" (written beside {out.name})"

@@ -265,8 +265,13 @@ def run_painting(request: JobSpec, listener: Listener, options: WorkerOptions) -
         after = replace(file, scene=replace(file.scene, sh_dc=painted.sh_dc))
         save_thumbnail(options.preview_folder, *(_render(rasterizer, each, camera) for each in (file, after)))
     _write(request, inputs, painted, time.perf_counter() - started)
-    before, after_ = painted.psnr_before, painted.psnr_after
-    return Result(stopped="finished", steps=PASSES, total=PASSES, psnr_before=before, psnr_after=after_)
+    return Result(
+        stopped="finished",
+        steps=PASSES,
+        total=PASSES,
+        psnr_before=painted.psnr_before,
+        psnr_after=painted.psnr_after,
+    )
 
 
 def _write(request: JobSpec, inputs: PaintInputs, painted: Painted, seconds: float) -> None:

@@ -239,10 +239,9 @@ def run_rank(
     start = max(time.time() - options.started, 0.0) if collectives is None else 0.0
     if collectives is None:  # PyTorch knows the cores of the machine only
         torch.set_num_threads(min(torch.get_num_threads(), container.cores()))
-    preview, collectives = None, collectives or ALONE
+    collectives, folder = collectives or ALONE, options.preview_folder
     left = seconds_left(request.settings.within, options.started)
-    if options.preview_folder:
-        preview = Previews(options.preview_folder, options.preview_seconds, listener.warn)
+    preview = Previews(folder, options.preview_seconds, listener.warn) if folder else None
     job = prepare(
         request,
         collectives=collectives,
@@ -438,8 +437,7 @@ class RankProcess:
         started, attempts = time.monotonic(), task.workers["attempts"]
 
         def progress(current: Progress) -> None:
-            latest = self._status.progress
-            if current.is_step and not (latest and latest.is_step) and attempts:
+            if attempts and current.is_step and not (self._status.progress and self._status.progress.is_step):
                 since = time.monotonic() - started
                 attempts[-1]["seconds_lost"] = round(task.seconds_lost + since, 3)
                 attempts[-1]["seconds_to_resume"] = round(task.seconds_since_loss + since, 3)

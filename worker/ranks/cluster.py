@@ -17,7 +17,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -44,7 +43,8 @@ _DAEMONS = ("raylet", "gcs_server")
 class Cluster:
     """Ray instance or cluster, as a context manager.
 
-    Ray ends with the thread that started it, so `open` must be called on the main thread.
+    Ray ends with the thread that started it, so `open` must be called on the main thread; on others, Python's `signal`
+    raises an error.
 
     Args:
         workers: Maximum number of ranks that run at once.
@@ -58,11 +58,6 @@ class Cluster:
         self._folder: Path | None = None
         self._sweeper: subprocess.Popen[bytes] | None = None
         self._daemons: list[psutil.Process] = []
-
-    @property
-    def local(self) -> bool:
-        """Return whether this is a local instance rather than a cluster."""
-        return self.address is None
 
     def __enter__(self) -> Cluster:
         self.open()
@@ -81,31 +76,29 @@ class Cluster:
             SettingsError: If no local instance can be started on this system.
             ClusterAwayError: If the cluster cannot be joined.
         """
-        if threading.current_thread() is not threading.main_thread():
-            raise RuntimeError("Ray must be started on the main thread: it ends with the thread that started it")
         before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
         try:
             if hasattr(signal, "SIGHUP"):  # Ray's processes inherit this: they must outlast a closed terminal
                 signal.signal(signal.SIGHUP, signal.SIG_IGN)
             with contextlib.chdir("/"):  # Ray lets its processes import modules from the current folder
-                if self.local:
+                if self.address is None:
                     self._start()
                 else:
-                    self._join()
+                    self._join(self.address)
         finally:
             for number, handler in before.items():  # restore the handlers that Ray has replaced
                 signal.signal(number, handler)
 
-    def _join(self) -> None:
+    def _join(self, address: str) -> None:
         import ray
 
         _silence_ray()
         try:
-            _check_answers(str(self.address))
-            ray.init(address=self.address, log_to_driver=False, logging_level=logging.CRITICAL)
+            _check_answers(address)
+            ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
         except Exception as error:  # Ray raises errors of many types here, some of them built-in
             raise ClusterAwayError(
-                f"The Ray cluster at {self.address} cannot be reached: {first_line(error)}. Check RAY_ADDRESS, or "
+                f"The Ray cluster at {address} cannot be reached: {first_line(error)}. Check RAY_ADDRESS, or "
                 "leave it out for workers on this machine."
             ) from error
 
@@ -175,8 +168,7 @@ def _check_answers(address: str) -> None:
 def _is_running(process: psutil.Process) -> bool:
     """Return whether a process has not ended."""
     try:
-        zombie: bool = process.status() == psutil.STATUS_ZOMBIE
-        return process.is_running() and not zombie
+        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
         return False
 
