@@ -13,7 +13,7 @@ from PIL.PngImagePlugin import PngInfo
 from api.cli.console import BAD_INPUT
 from api.cli.main import main
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.painting.solver import PASSES
+from sgsst_core.painting import PASSES
 from sgsst_core.progress import Progress
 from sgsst_core.settings import make_settings
 from tests.small_scenes import wall
