@@ -39,7 +39,7 @@ from sgsst_core.files.photos import Photo, check_names, find_masks, load_photo
 from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_property, read_scene, stays_in_file
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.orbit import Orbit
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.facts import check_scales
 from sgsst_core.planning.plan import OPTIMIZER_BYTES
 from sgsst_core.planning.survey import nothing_seen, sees_something

@@ -15,7 +15,7 @@ from worker.job import JobSpec, Result, Resume
 from worker.ranks.rank import WorkerOptions
 
 if TYPE_CHECKING:
-    from sgsst_core.parallel.collectives import Collectives
+    from sgsst_core.parallel import Collectives
     from sgsst_core.progress import Progress
     from worker.prepare import Prepared
 
@@ -138,7 +138,7 @@ def run_rank(
 
     from sgsst_core import container
     from sgsst_core.devices import seconds_left
-    from sgsst_core.parallel.collectives import ALONE
+    from sgsst_core.parallel import ALONE
     from worker.execute import execute
     from worker.prepare import Previews, describe, prepare
 

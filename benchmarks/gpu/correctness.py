@@ -34,7 +34,7 @@ from sgsst_core.bench.device_checks import (
     views,
 )
 from sgsst_core.features.vgg import has_bfloat16
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.rasterizer import drawing_problem, make_rasterizer
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer

@@ -29,7 +29,7 @@ from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, use_whole_floa
 from sgsst_core.features.weight_files import cache_folder, damage_of
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.parallel import ALONE
 from sgsst_core.planning.facts import describe_machine, gpu_problems
 from sgsst_core.planning.plan import choose_precision
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer, rasterizer_for

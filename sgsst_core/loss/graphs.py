@@ -17,7 +17,7 @@ from sgsst_core.devices import Timer
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.terms import TERMS, StyleTargets, ViewTarget
-from sgsst_core.parallel.division import Division, Tiling
+from sgsst_core.parallel import Division, Tiling
 
 #: Maximum number of cached graphs. Each takes about 1 MB, in addition to the memory pool that all graphs share.
 MAX_GRAPHS = 256

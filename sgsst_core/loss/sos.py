@@ -38,9 +38,10 @@ from sgsst_core.loss.terms import (
     positions_in,
     positions_per_image,
 )
-from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.parallel.division import (
+from sgsst_core.parallel import (
+    ALONE,
     RENDERING,
+    Collectives,
     Divider,
     Division,
     Piece,

@@ -34,7 +34,7 @@ from sgsst_core.features.statistics import (
     row_cells,
 )
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.parallel.division import Division, PositionWeights, ScaledView
+from sgsst_core.parallel import Division, PositionWeights, ScaledView
 from sgsst_core.settings import StyleLossName
 
 

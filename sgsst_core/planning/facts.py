@@ -23,8 +23,7 @@ from sgsst_core.features.vgg import (
 )
 from sgsst_core.loss.graphs import can_use_graphs
 from sgsst_core.loss.terms import layers_of
-from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.parallel.division import Size, Tiling
+from sgsst_core.parallel import Collectives, Size, Tiling
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import Rasterizer, drawing_problem, gpu_rasterizers, make_rasterizer, rasterizer_for
 from sgsst_core.rasterizer.base import Precision as WeightPrecision

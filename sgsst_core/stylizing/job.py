@@ -23,8 +23,7 @@ from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
 from sgsst_core.loss.terms import StyleTargets, ViewTarget, combined
 from sgsst_core.orbit import Orbit
-from sgsst_core.parallel.collectives import ALONE, Collectives, Team
-from sgsst_core.parallel.division import Size
+from sgsst_core.parallel import ALONE, Collectives, Size, Team
 from sgsst_core.planning.facts import PlanningContext, make_network, sharing_memory
 from sgsst_core.planning.plan import Plan, ends_with_transfer
 from sgsst_core.planning.time_budget import TimeChoice

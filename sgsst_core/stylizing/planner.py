@@ -29,7 +29,7 @@ from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import has_statistics
 from sgsst_core.orbit import orbit_decisions
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.facts import (
     Facts,
     PlanningContext,

@@ -17,8 +17,18 @@ from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import ContentFeatures, ViewTarget
-from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, ShownGaussians
-from sgsst_core.parallel.division import Divider, Division, Piece, ScaledView, Shares, ViewImages
+from sgsst_core.parallel import (
+    ALONE,
+    Collectives,
+    Divider,
+    Division,
+    ImageExchange,
+    Piece,
+    ScaledView,
+    Shares,
+    ShownGaussians,
+    ViewImages,
+)
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions import ContentMaps, RegionMaps
 from sgsst_core.scene.camera import Camera

@@ -26,7 +26,7 @@ from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.images import save_png
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from sgsst_core.orbit import orbit
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors

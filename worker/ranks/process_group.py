@@ -28,7 +28,7 @@ from torch import Tensor
 from sgsst_core.errors import SgsstError
 from sgsst_core.features.statistics import LayerStatistics
 from sgsst_core.messages import decode, encode
-from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, ImageExchange, Traffic
+from sgsst_core.parallel import ALONE, TRAFFIC, Collectives, ImageExchange, Traffic
 from worker.processes import interface_towards, listen, split_address
 
 T = TypeVar("T")

@@ -23,7 +23,7 @@ from worker.options import RunOptions
 from worker.processes import ProcessId, die_with_parent, listen
 
 if TYPE_CHECKING:
-    from sgsst_core.parallel.collectives import Collectives
+    from sgsst_core.parallel import Collectives
     from sgsst_core.progress import Progress
     from worker.job import JobSpec, Result, Resume
     from worker.prepare import Prepared

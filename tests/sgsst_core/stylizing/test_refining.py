@@ -15,7 +15,7 @@ from torch import Tensor
 from sgsst_core import refine as module
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.parallel import Collectives
 from sgsst_core.planning.survey import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer

@@ -14,8 +14,7 @@ from torch import Tensor
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
-from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
-from sgsst_core.parallel.division import Divider, Tiling
+from sgsst_core.parallel import ALONE, Collectives, Divider, Tiling, Traffic
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions import Region, Regions
