@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import sos_reference
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import NEAR
 from sgsst_core.features.layers import winograd_pays_off
 from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeights, load_network_weights
@@ -25,7 +26,6 @@ from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.facts import DTYPES
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import TENSORS, Scene

@@ -14,7 +14,6 @@ from sgsst_core.constants import NEAR, RASTER_TILE
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.base import Color, Rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -23,7 +22,7 @@ __all__ = ["RASTERIZERS", "Rasterizer", "drawing_problem", "gpu_rasterizers", "m
 
 #: All rasterizers by name; those for GPUs in order of preference.
 RASTERIZERS: dict[str, type[Rasterizer]] = {
-    kind.name: kind for kind in (TritonRasterizer, CpuRasterizer, CachedRasterizer, ReferenceRasterizer)
+    kind.name: kind for kind in (TritonRasterizer, CpuRasterizer, CachedRasterizer)
 }
 
 
@@ -41,7 +40,7 @@ def make_rasterizer(
 
     Args:
         name: `cpu` computes blend weights in every call; `cached` stores them (its options are `precision`, `max_bytes`
-            and `uncached`); `triton` runs on GPUs; `reference` is slow and float64.
+            and `uncached`); `triton` runs on GPUs.
         scene, background: As in `Rasterizer`.
         device: Device for `cached` and `triton`. None selects the CPU for `cached` (or the device of its option
             `uncached`), and the current GPU for `triton`.

@@ -56,7 +56,7 @@ class JobInputs:
         photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
             for unstylized renders.
         regions: Regions of the scene, each with its own style or frozen; None for one style everywhere.
-        rasterizer: Rasterizer that computes blend weights: "cpu", "triton" or "reference". None to choose one.
+        rasterizer: Rasterizer that computes blend weights: "cpu" or "triton". None to choose one.
         measured: Whether quality is measured and a report is written, as in `sgsst stylize`.
         orbit: Orbit that produced the cameras, for the plan to report; None for cameras from files.
         about_inputs: Decisions about cameras and photos that start the plan.

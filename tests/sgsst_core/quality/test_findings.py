@@ -9,6 +9,7 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
+from benchmarks.stability.splat_reference import splat
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
@@ -25,7 +26,6 @@ from sgsst_core.quality.findings import (
 from sgsst_core.quality.measure import scene_psnr
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.projection import project
-from sgsst_core.rasterizer.reference import splat
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering

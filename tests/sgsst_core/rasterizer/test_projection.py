@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.stability.splat_reference import splat
 from sgsst_core.constants import EPS2D
 from sgsst_core.rasterizer.projection import (
     Column,
     project,
 )
-from sgsst_core.rasterizer.reference import splat
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering

@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import Rasterizer, drawing_problem, make_rasterizer
 from sgsst_core.rasterizer.base import Precision
 from sgsst_core.rasterizer.projection import build_tile_intersections
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
-from tests.sgsst_core.rasterizer.references import assert_background, assert_close_outside_band, relative_error
+from tests.benchmarks.stability.splat_references import assert_background, assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (
     camera,
     cloud,

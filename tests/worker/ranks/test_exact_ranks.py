@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
@@ -69,7 +70,7 @@ def gradient(
         scales=scale_weights,
         collectives=collectives,
     )
-    rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
+    rasterizer = make_rasterizer("cpu", scene) if dtype == torch.float32 else ReferenceRasterizer(scene)
     survey = survey_views(scene, [camera], rasterizer)
     weighted = survey.uncovered_fraction > 0.01
     style_images = Style.of(synthetic_image(90, 110, seed=4, dtype=dtype))
@@ -219,7 +220,7 @@ def stylize_each(collectives: Collectives) -> list[dict[str, Any]]:
         stylizer = Stylizer(job)
         run(stylizer)
         exact = prepare_job(
-            replace(job.plan, uncached="reference", cached_weights="none"),
+            replace(job.plan, uncached=ReferenceRasterizer.name, cached_weights="none"),
             JobInputs(*inputs, weights=weights),
             collectives=collectives,
         )
