@@ -27,7 +27,7 @@ from sgsst_core.constants import ALPHA_MIN, NEAR, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.projection import project
+from sgsst_core.rasterizer.cpu import project
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors, view_directions
 from sgsst_core.scene.stored_harmonics import held

@@ -113,7 +113,8 @@ class ReferenceRasterizer(Rasterizer):
             image[area] = weights @ colors[gaussians] + left[..., None] * self.background
         return image
 
-    def _coverage(self, camera: Camera) -> Tensor:
+    def coverage(self, camera: Camera) -> Tensor:
+        """Return 1 - T_final, [h, w]."""
         coverage = torch.empty(camera.height, camera.width, dtype=self.dtype)
         for area, _, alpha in self._alphas(camera):
             coverage[area] = 1 - _blended(alpha)[1]

@@ -21,7 +21,7 @@ from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.planning.survey import Survey, survey_views
 from sgsst_core.quality.measure import scene_psnr
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.projection import Column, Shapes, project
+from sgsst_core.rasterizer.cpu import Column, Shapes, project
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.colors import style_size
 from sgsst_core.scene.gaussians import Scene

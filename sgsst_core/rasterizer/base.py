@@ -41,7 +41,7 @@ def camera_key(camera: Camera) -> CameraKey:
 class Rasterizer(ABC):
     """Renderer of a scene with frozen geometry and arbitrary colors.
 
-    A new rasterizer implements `_render`, `_coverage` and `_color_gradient` and is listed in
+    A new rasterizer implements `_render`, `coverage` and `_color_gradient` and is listed in
     `sgsst_core.rasterizer.RASTERIZERS`; everything else has a default. Public methods accept colors and image gradients
     of any floating dtype on any device. Results are on `device`, in `dtype`. A wrong shape raises ValueError.
 
@@ -102,9 +102,9 @@ class Rasterizer(ABC):
             raise ValueError(f"colors of shape {tuple(colors.shape)}: the scene needs {expected}")
         return self._render(self._converted(colors), camera)
 
+    @abstractmethod
     def coverage(self, camera: Camera) -> Tensor:
         """Return 1 - T_final, [h, w] in [0, 1]: how much of each pixel the Gaussians cover."""
-        return self._coverage(camera)
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
         """Return W^T dL/dimage, [N, 3], given the image gradient [h, w, 3]."""
@@ -125,10 +125,6 @@ class Rasterizer(ABC):
     @abstractmethod
     def _render(self, colors: Tensor, camera: Camera) -> Tensor:
         """Implement `render` for valid arguments on the rasterizer's device, in its dtype."""
-
-    @abstractmethod
-    def _coverage(self, camera: Camera) -> Tensor:
-        """Implement `coverage`."""
 
     @abstractmethod
     def _color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
@@ -152,12 +148,7 @@ class Rasterizer(ABC):
 
     @property
     def uncached(self) -> Rasterizer:
-        """Rasterizer that computes blend weights in every call."""
-        return self
-
-    @property
-    def repeatable(self) -> Rasterizer:
-        """Rasterizer whose images are bit-identical whether or not weights are cached."""
+        """Rasterizer that computes blend weights in every call, so that images do not depend on what is cached."""
         return self
 
     def count_weights(self, camera: Camera) -> CountedPieces:

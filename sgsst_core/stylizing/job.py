@@ -465,7 +465,6 @@ def prepare_job(
     )
     if plan.spare:
         views.caches["intersections"].limit(memory_for("rasterizer", memory) + plan.spare // 2)
-    repeatable = rasterizer.repeatable
     view_targets = ViewTargets(
         views,
         loss,
@@ -475,8 +474,8 @@ def prepare_job(
         regions=plan.survey.regions if plan.weighted else None,
         background=settings.background,
         drawn=plan.training_background != "background",
-        maps=styles.maps(repeatable, plan.seen),
-        content_maps=styles.content_maps(repeatable, plan.seen),
+        maps=styles.maps(rasterizer.uncached, plan.seen),
+        content_maps=styles.content_maps(rasterizer.uncached, plan.seen),
     )
     return StylizationJob(
         plan=plan,

@@ -128,7 +128,7 @@ class Views:
 
         It does not depend on which blend weights are cached, because it is cached itself over many steps.
         """
-        return self.render(index, self.colors(index, self._sh_dc), self.rasterizer.repeatable)
+        return self.render(index, self.colors(index, self._sh_dc), self.rasterizer.uncached)
 
     def window(self, index: int, make: Callable[[Camera], Tensor], *shape: int) -> Tensor:
         """Return this rank's rectangle [h, w, *shape] of a view, from a function of its camera.
@@ -481,7 +481,7 @@ class ViewTargets:
         return self._divisions[key]
 
     def _rendered_coverage(self, index: int) -> list[Tensor]:
-        window = self.views.window(index, self.views.rasterizer.repeatable.coverage)
+        window = self.views.window(index, self.views.rasterizer.uncached.coverage)
         return self.loss.targets.position_weights(self.views.whole(index, window))
 
     def _rendered_maps(self, index: int, render: Callable[[Camera], Tensor], count: int) -> list[list[Tensor]]:

@@ -25,7 +25,7 @@ from sgsst_core.quality.findings import (
 )
 from sgsst_core.quality.measure import scene_psnr
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.projection import project
+from sgsst_core.rasterizer.cpu import project
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering

@@ -20,8 +20,8 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
-from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.projection import (
+from sgsst_core.rasterizer.cpu import (
+    CpuRasterizer,
     project,
 )
 from sgsst_core.scene.camera import Camera
