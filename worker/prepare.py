@@ -23,10 +23,10 @@ from sgsst_core import container
 from sgsst_core.devices import Timer
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.features.vgg import weights_for
 from sgsst_core.files.images import save_jpg
 from sgsst_core.files.scene_file import SceneFile, write_scene
 from sgsst_core.files.stylized_ply import write_colors
-from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.facts import common_device, rasterizer_problem
 from sgsst_core.planning.plan import LOSS_VIEWS, Plan

@@ -16,7 +16,6 @@ from sgsst_core.features.partition import computed_twice, scaled_region
 from sgsst_core.features.vgg import (
     FeatureNetwork,
     has_bfloat16,
-    has_float16,
     has_matrix_units,
     has_tf32,
     use_whole_float32,
@@ -215,7 +214,7 @@ def describe_machine(settings: Settings, collectives: Collectives) -> Machine:
     # The partition, and thereby rounding, depends on the limit, so it must be identical on all ranks.
     limit = settings.memory_limit or default_memory_limit(torch.device(device))
     has: dict[PlannedPrecision, bool] = {
-        "float16": has_float16(device),
+        "float16": has_tf32(device),
         "bfloat16": has_matrix_units() if device == "cpu" else has_bfloat16(device),
         "tf32": has_tf32(device),
         "winograd": device == "cpu",

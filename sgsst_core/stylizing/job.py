@@ -17,8 +17,7 @@ from sgsst_core.budget import Cache, forget_device_peak, memory_for
 from sgsst_core.devices import Timer
 from sgsst_core.errors import DeviceMemoryError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.feature_scale import weights_for
+from sgsst_core.features.vgg import FeatureNetwork, weights_for
 from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
 from sgsst_core.loss.terms import StyleTargets, ViewTarget, combined

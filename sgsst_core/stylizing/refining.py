@@ -19,7 +19,7 @@ from torch import Tensor
 
 from sgsst_core.budget import memory_for
 from sgsst_core.constants import SH_C0
-from sgsst_core.loss.feature_scale import weights_for
+from sgsst_core.features.vgg import weights_for
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import StyleTargets, ViewTarget
 from sgsst_core.parallel import ALONE, Collectives

@@ -12,17 +12,20 @@ from benchmarks.stability.sos_reference import StyledWeights, sos_reference, sty
 from sgsst_core.errors import ImageError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.statistics import layer_statistics
-from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss import terms as nearest
-from sgsst_core.loss.feature_scale import (
+from sgsst_core.features.vgg import (
+    CONTENT_LAYER,
     EVEN_COLOR_SCALE,
     EVEN_PIXEL_SCALE,
     EVEN_SCALE,
+    PIXELS,
     PUBLISHED,
+    STYLE_LAYERS,
+    FeatureNetwork,
     at_scale,
     paper_scales,
     with_scales,
 )
+from sgsst_core.loss import terms as nearest
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import (
     MAX_VECTORS,
