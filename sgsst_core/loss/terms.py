@@ -161,29 +161,6 @@ class ViewTarget:
 
 
 @dataclass(frozen=True)
-class TermInputs:
-    """Inputs of the terms of one scale of a view.
-
-    Attributes:
-        regions: Style targets with the positions of their regions; a single one if the scene has no regions.
-        content_weight: lambda_c; 0 for no content term.
-        content: Content features; None without a content term.
-        coverage: Position weights of terms that do not depend on the style.
-        content_weights: Position weights of the content term, relative to its weight; None for `coverage`.
-    """
-
-    view: ScaledView
-    network: FeatureNetwork
-    style_loss: StyleLossName
-    content_weight: float
-    regions: Sequence[StyleTarget]
-    content: ContentFeatures | None
-    coverage: PositionWeights
-    content_weights: PositionWeights
-    timer: Timer
-
-
-@dataclass(frozen=True)
 class LossTerms:
     """Loss of one scale, split into its terms; the fields are the names in `TERMS`, in the same order."""
 
@@ -429,11 +406,10 @@ class StatisticsTerms:
     the number of positions. There is no gradient before the statistics of the whole scale are compared.
     """
 
-    def __init__(self, inputs: TermInputs, layers: Sequence[str]) -> None:
-        self._view = inputs.view
-        self._network = inputs.network
-        self._regions = inputs.regions
-        self._layers = layers
+    def __init__(
+        self, view: ScaledView, network: FeatureNetwork, regions: Sequence[StyleTarget], layers: Sequence[str]
+    ) -> None:
+        self._view, self._network, self._regions, self._layers = view, network, regions, layers
         #: Gradients by layer, with the regions that they apply to.
         self._gradients: dict[str, list[tuple[StyleGradient, StyleTarget]]] = {}
 
@@ -643,16 +619,16 @@ class ContentTerm:
     factor: Tensor
 
     @classmethod
-    def of(cls, inputs: TermInputs) -> Self | None:
-        """Return the term of one scale of a view; None if the loss does not have it."""
-        if inputs.content is None:
-            return None
-        count = inputs.view.count(CONTENT_LAYER, inputs.coverage)
-        network = inputs.network
-        weight = inputs.content_weight * network.feature_unit**2 * network.loss_factor
-        factor = content_factor(count, network.channels(CONTENT_LAYER), weight)
-        weights = inputs.coverage if inputs.content_weights is None else inputs.content_weights
-        return cls(inputs.view, inputs.content, weights, factor)
+    def of(cls, view: ScaledView, network: FeatureNetwork, weight: float, target: ViewTarget) -> Self:
+        """Return the term of one scale of a view.
+
+        Args:
+            weight: lambda_c.
+        """
+        weight = weight * network.feature_unit**2 * network.loss_factor
+        factor = content_factor(view.count(CONTENT_LAYER, target.coverage), network.channels(CONTENT_LAYER), weight)
+        weights = target.coverage if target.content_weights is None else target.content_weights
+        return cls(view, target.content[view.scale], weights, factor)
 
     def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
         """Return the contribution of the cells that a tile owns, float64 scalar, given features by layer."""
@@ -949,18 +925,23 @@ class NearestTerm:
     matches: dict[PartitionTile, list[Matches]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, inputs: TermInputs) -> Self | None:
-        """Return the term of one scale of a view; None if the loss does not have it."""
-        network = inputs.network
-        layers = nearest_layers(inputs.style_loss, network.name)
-        regions = []
-        for style in inputs.regions if layers else ():
+    def of(
+        cls,
+        view: ScaledView,
+        network: FeatureNetwork,
+        style_loss: StyleLossName,
+        styles: Sequence[StyleTarget],
+        timer: Timer,
+    ) -> Self:
+        """Return the term of one scale of a view, given the style targets of its regions."""
+        layer, regions = nearest_layers(style_loss, network.name)[0], []
+        for style in styles:
             if style.vectors is not None:
-                count = inputs.view.count(layers[0], style.positions)
-                weight = style.weight * nearest_weight(inputs.style_loss, network.unit) * network.loss_factor
+                count = view.count(layer, style.positions)
+                weight = style.weight * nearest_weight(style_loss, network.unit) * network.loss_factor
                 factor = weight / torch.where(count > 0, count, torch.inf)
                 regions.append((style.vectors, factor, style.positions))
-        return cls(inputs.view, layers[0], network.rounding, inputs.timer, regions) if regions else None
+        return cls(view, layer, network.rounding, timer, regions)
 
     def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
         """Return the contribution of the cells that a tile owns, float64 scalar."""
@@ -995,7 +976,6 @@ class NearestTerm:
 #: Names of the terms whose sum is the loss of a scale, in the order of summation.
 TERMS = (*STATISTICS_TERMS, ContentTerm.name, NearestTerm.name)
 #: Terms that are sums over the positions of a view. Every tile adds the positions that it owns.
-POSITION_TERMS = (ContentTerm, NearestTerm)
 PositionTerm = ContentTerm | NearestTerm
 
 

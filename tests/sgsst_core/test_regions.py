@@ -581,7 +581,7 @@ def test_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
     (used,) = stylizer.job.style.images
     assert used.shape == (60, 40, 3)
-    assert stylizer.job.loss.targets.style_scale == 2
+    assert stylizer.job.loss.style_scale == 2
     weights = stylizer.job.plan.survey.total_blend_weights
     (wanted,) = prepared_style(Style.of(style), settings, scene.sh_dc, weights).images
     assert torch.equal(used, wanted)
