@@ -16,8 +16,7 @@ import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
-from typing import Literal, TypeVar, get_args
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -41,10 +40,6 @@ from sgsst_core.scene.colors import add_upscaled_, downscale
 from sgsst_core.settings import Settings
 
 T = TypeVar("T")
-
-#: Purposes for which tensors are sent.
-Traffic = Literal["image", "statistics", "gradient"]
-TRAFFIC: tuple[Traffic, ...] = get_args(Traffic)
 
 
 @dataclass(frozen=True)
@@ -74,15 +69,12 @@ class Collectives:
     Attributes:
         local_size: Number of ranks on this machine, including this one.
         gpu_sharing: Largest number of ranks on one GPU; 1 without GPUs.
-        sent: Bytes of tensors sent by this rank so far, assuming ring algorithms; other messages are negligible. The
-            count is shared between this group, its parent group and its subgroups.
     """
 
     rank: int = 0
     size: int = 1
     local_size: int = 1
     gpu_sharing: int = 1
-    sent: Mapping[Traffic, int] = MappingProxyType(dict.fromkeys(TRAFFIC, 0))
 
     def gather_parts(
         self, exchanges: Sequence[ImageExchange], parts: Sequence[Tensor], windows: Sequence[Tensor]
@@ -103,7 +95,7 @@ class Collectives:
         """
         raise NotImplementedError("a single rank has whole images")
 
-    def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
+    def all_reduce(self, tensor: Tensor) -> Tensor:
         """Return the sum over all ranks, identical on all ranks. The argument may be overwritten."""
         return tensor
 
