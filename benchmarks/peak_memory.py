@@ -35,7 +35,7 @@ def main() -> None:
         "height": SIZE[0],
         "backbone": network.name,
         "activation_budget_gb": MEMORY,
-        "tiles": len(loss.divider.tiles(SIZE)),
+        "tiles": len(loss.tiling.tiles(SIZE)),
         "seconds": timer.read()["gradient"],
         "peak_gb": peak_memory() / 1e9,
     }

@@ -599,13 +599,6 @@ class Divider:
             },
         )
 
-    def tiles(self, size: Size, coverage: Tensor | None = None) -> list[PartitionTile]:
-        """Return the partition tiles of a scaled view of size (height, width).
-
-        If `coverage` [h, w] is given, pixels with coverage 0 may not belong to any tile.
-        """
-        return self._partition(self._piece(0, size, coverage), coverage)
-
     def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
         """Return the piece of one scale that contains all pixels that the network has to process."""
         if coverage is None:

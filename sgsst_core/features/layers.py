@@ -163,16 +163,11 @@ def has_pooling_kernel(source: Tensor) -> bool:
 
 def max_pool_backward_reference(gradient: Tensor, source: Tensor) -> Tensor:
     """Compute `max_pool_backward` with PyTorch operations, on any device."""
+    positions = F.max_pool2d(source, 2, return_indices=True)[1]
     spread: Tensor = torch.ops.aten.max_pool2d_with_indices_backward(
-        gradient, source, [2, 2], [2, 2], [0, 0], [1, 1], False, max_positions(source)
+        gradient, source, [2, 2], [2, 2], [0, 0], [1, 1], False, positions
     )
     return relu_backward(spread, source)
-
-
-def max_positions(source: Tensor) -> Tensor:
-    """Return the flat index within its plane of the first maximum of each window, [1, c, h // 2, w // 2] int64."""
-    positions: Tensor = F.max_pool2d(source, 2, return_indices=True)[1]
-    return positions
 
 
 def relu_backward(gradient: Tensor, output: Tensor) -> Tensor:

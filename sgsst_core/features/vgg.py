@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,6 @@ from sgsst_core.features.layers import (
     has_pixel_kernels,
     max_pool,
     max_pool_backward,
-    max_positions,
     pixel_gradient,
     relu_backward,
     transform_weight,
@@ -126,11 +124,6 @@ class Activations:
     features: dict[str, Tensor]
     outputs: list[Tensor] = field(default_factory=list)
     size: tuple[int, int] = (0, 0)
-
-    def decisions(self) -> list[Tensor]:
-        """Return the discrete decisions of each step: ReLU masks, and positions of pooling maxima."""
-        pairs = pairwise([*self.outputs[:1], *self.outputs])
-        return [output > 0 if output.numel() else max_positions(source) for source, output in pairs]
 
 
 def use_whole_float32() -> None:

@@ -456,7 +456,7 @@ class TargetBuilder:
             layer: torch.empty((len(positions), self._loss.network.channels(layer)), dtype=self._loss.network.dtype)
             for layer in self._loss.matched
         }
-        for tile in self._loss.divider.tiles(size):
+        for tile in self._loss.tiling.tiles(size):
             features = self._forward(image[tile.outer.slices]).features
             in_image, in_tile = tile.owned_cells(self._loss.matched[0], size)
             inside, row, column = positions_in(positions, width, in_image)

@@ -24,8 +24,9 @@ from sgsst_core.loss.graphs import can_use_graphs
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel import Collectives, Size, Tiling
 from sgsst_core.planning.survey import Survey
-from sgsst_core.rasterizer import Rasterizer, drawing_problem, gpu_rasterizers, make_rasterizer, rasterizer_for
+from sgsst_core.rasterizer import Rasterizer, drawing_problem, make_rasterizer, rasterizer_for
 from sgsst_core.rasterizer.base import Precision as WeightPrecision
+from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scales import ScaleWeights, scale_count
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
@@ -261,17 +262,9 @@ def common_device(collectives: Collectives) -> Device:
 
 
 def gpu_problems(collectives: Collectives) -> dict[str, str]:
-    """Return the problem of each GPU rasterizer that does not work on some rank, by the rasterizer's name.
-
-    Rasterizers are tried in order of preference, until one works.
-    """
-    problems: dict[str, str] = {}
-    for name in gpu_rasterizers():
-        problem = rasterizer_problem(collectives, name)
-        if problem is None:
-            break
-        problems[name] = problem
-    return problems
+    """Return the problem of the GPU rasterizer by its name, if it does not work on some rank."""
+    problem = rasterizer_problem(collectives, TritonRasterizer.name)
+    return {} if problem is None else {TritonRasterizer.name: problem}
 
 
 def rasterizer_problem(collectives: Collectives, name: str) -> str | None:

@@ -7,7 +7,8 @@ the blend weights and T_final is the final transmittance. The gradient with resp
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, Self, TypeVar
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -178,19 +179,11 @@ class Rasterizer(ABC):
         """Drop all cached data of views, because other views or other rectangles of them are rendered from now on."""
 
 
-class Sized(Protocol):
-    """Object with a known memory use."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory use in bytes."""
-
-
-L = TypeVar("L", bound=Sized)
+L = TypeVar("L")
 
 
 class TiledRasterizer(Rasterizer, Generic[L]):
-    """Rasterizer whose tile intersections are cached within a budget, besides those of the latest view.
+    """Rasterizer whose tile intersections, of type L, are cached within a budget, besides those of the latest view.
 
     Args:
         scene, background, near, device: As in `Rasterizer`.
@@ -202,7 +195,7 @@ class TiledRasterizer(Rasterizer, Generic[L]):
     def __init__(self, scene: Scene, *, max_intersection_bytes: int | None = None, **common: Any) -> None:
         super().__init__(scene, max_intersection_bytes=max_intersection_bytes, **common)
         budget = self.default_intersection_bytes if max_intersection_bytes is None else max_intersection_bytes
-        self._intersections: Cache[CameraKey, L] = Cache(budget, lambda isects: isects.nbytes, holds_latest=True)
+        self._intersections: Cache[CameraKey, L] = Cache(budget, attrgetter("nbytes"), holds_latest=True)
 
     @classmethod
     def options(cls, memory: int) -> dict[str, Any]:
