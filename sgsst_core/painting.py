@@ -153,7 +153,7 @@ class PaintedColors:
         """
         original, own = self.original[self._shown], base[self._shown]
         least, most = original.clamp_max(0), original.clamp_min(1)
-        x = self._unclamped(own)
+        x = torch.maximum(own, -torch.stack(self._rest).amax(dim=0))  # clamped colors can rise, and the images stay
         error, passing = self._descent(x, own)
         free = torch.ones_like(x, dtype=torch.bool)
         if bounded:
@@ -176,10 +176,6 @@ class PaintedColors:
         colors = base.clone()
         colors[self._shown] = torch.clamp(x, least, most) if bounded else x
         return colors, (before / first) ** 0.5 if first else 0.0
-
-    def _unclamped(self, x: Tensor) -> Tensor:
-        """Raise clamped colors to the clamp of the views: the images stay, and they can rise."""
-        return torch.maximum(x, -torch.stack(self._rest).amax(dim=0))
 
     def _descent(self, x: Tensor, base: Tensor) -> tuple[Tensor, list[Tensor]]:
         """Return half the negative gradient of the objective, and for each view which channels change its image."""

@@ -224,30 +224,15 @@ def span_positions(positions: int, channels: int) -> int:
     return min(max(least, 1 << max(span.bit_length() - 1, 0)), most)
 
 
-def block_of_positions(default: int) -> int:
-    """Return the number of positions per step of a program: `default`, or more in Triton's interpreter."""
-    return 4096 if _is_interpreted() else default
-
-
 def block_of_entries(channels: int) -> int:
     """Return the number of matrix entries per program, in whole rows."""
     channels = max(channels, MIN_CHANNELS)
-    return min(channels**2, 1 << 18 if _is_interpreted() else max(ENTRIES, channels))
+    return min(channels**2, max(ENTRIES, channels))
 
 
 def block_of_channels(channels: int, most: int | None = None) -> int:
     """Return the number of channels per step: all of them, or at most `most`."""
     return min(max(channels, MIN_CHANNELS), most or max(channels, MIN_CHANNELS))
-
-
-def _is_interpreted() -> bool:
-    """Return whether Triton runs in its interpreter.
-
-    The time of an operation in the interpreter hardly depends on its size, so large blocks are best.
-    """
-    import triton
-
-    return bool(triton.knobs.runtime.interpret)
 
 
 def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
@@ -263,7 +248,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     height, width, channels = features.shape
     device, positions = features.device, height * width
     span, tile = span_positions(positions, channels), block_of_channels(channels, TILE)
-    block = block_of_positions(POSITIONS[features.element_size()])
+    block = POSITIONS[features.element_size()]
     shift = None
     if features.dtype == torch.float32:
         shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1))

@@ -476,7 +476,7 @@ def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
     """
     expected = F.conv2d(x, step.weight, step.bias, padding=1).relu_()
     largest = float(expected.amax())  # none is negative
-    _leave_nan(expected)
+    torch.full_like(expected, torch.nan)  # fills memory that the allocator reuses for the next tensor of this size
     try:
         output = _fused_convolution(x, step)
     except RuntimeError:  # cuDNN has no engine for it
@@ -484,11 +484,6 @@ def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
     same_layout = output.stride() == expected.stride()
     difference = float(expected.sub_(output).abs_().amax())
     return output if same_layout and difference <= _TRIAL_TOLERANCE * largest else None
-
-
-def _leave_nan(like: Tensor) -> None:
-    """Fill memory that the allocator reuses for the next tensor of this size with NaN."""
-    torch.full_like(like, torch.nan)
 
 
 #: Factor of every layer except the first, for feature scale `even`. With this factor, Gram matrix, mean and standard

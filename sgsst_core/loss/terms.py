@@ -25,7 +25,6 @@ from sgsst_core.features.statistics import (
     LayerStatistics,
     block_of_channels,
     block_of_entries,
-    block_of_positions,
     blocks_of,
     can_be_fused,
     center,
@@ -527,7 +526,7 @@ def fused_add_style_gradient(
     from sgsst_core.loss import triton_kernels as kernels
 
     height, width, channels = features.shape
-    positions, tile, block = height * width, block_of_channels(channels, TILE), block_of_positions(POSITIONS)
+    positions, tile = height * width, block_of_channels(channels, TILE)
     weights = features if position_weights is None else position_weights
     if features.dtype in SPLIT_UNITS:
         matrix, low, offset = style.split or style.about_zero(features.dtype)
@@ -535,10 +534,10 @@ def fused_add_style_gradient(
     else:
         matrix, low, mean, offset = style.matrix, None, style.mean, style.offset
     with on_device(features.device):
-        kernels.add_style_gradient[(-(-positions // block) * -(-channels // tile),)](
+        kernels.add_style_gradient[(-(-positions // POSITIONS) * -(-channels // tile),)](
             features, weights, gradient, matrix, low, mean, offset,
             positions, width, row_cells(features), *weights.stride()[:2], row_cells(gradient),
-            CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEPS[features.element_size()]), P=block,
+            CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEPS[features.element_size()]), P=POSITIONS,
             WEIGHTED=position_weights is not None, RELU=relu, UNIT=SPLIT_UNITS.get(features.dtype, 1.0),
         )  # fmt: skip
 

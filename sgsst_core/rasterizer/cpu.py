@@ -155,7 +155,10 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
             counts,
         )
         visible = [np.arange(start, start + own) for start, own in zip(chunks[:-1], counts, strict=True)]
-        order = depth_order(depths, np.concatenate(visible))
+        order = np.concatenate(visible)
+        # Depths are positive, because the near plane is at a positive depth.
+        bits = torch.from_numpy(depths.view(np.int64)[order])
+        order = order[torch.sort(bits, stable=True).indices.numpy()]
     return Projection(gaussians[order], torch.from_numpy(values).index_select(0, torch.from_numpy(order)).numpy())
 
 
@@ -301,21 +304,6 @@ def _project_chunks(
                 depths[position], gaussians[position] = depth, i
                 position += 1
         counts[chunk] = position - chunks[chunk]
-
-
-def depth_order(depths: NDArray[np.float64], visible: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Sort the indices of visible Gaussians by depth; equal depths stay in index order.
-
-    Args:
-        depths: [N] float64; positive for visible Gaussians, because the near plane is at a positive depth.
-        visible: [V], ascending indices into `depths`.
-
-    Returns:
-        `visible` sorted by depth.
-    """
-    bits = torch.from_numpy(depths.view(np.int64)[visible])
-    order: NDArray[np.int64] = visible[torch.sort(bits, stable=True).indices.numpy()]
-    return order
 
 
 #: Maximum number of pairs of Gaussian and raster tile, since their positions are 32-bit integers.
