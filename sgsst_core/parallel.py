@@ -179,14 +179,10 @@ class ShownGaussians:
         return self.count <= DENSE_FRACTION * self.total
 
     def indices(self) -> Tensor:
-        """Return the indices [count] int64 in ascending order."""
+        """Return the indices [count] int64 in ascending order, without synchronizing with a GPU."""
         if self._bits.device.type == "cpu":  # on a CPU, NumPy is an order of magnitude faster
-            mask = np.unpackbits(self._bits.numpy(), count=self.total, bitorder="little")
-            return torch.from_numpy(np.flatnonzero(mask))
-        return self._device_indices()
-
-    def _device_indices(self) -> Tensor:
-        """Compute `indices` on any device without synchronizing with it."""
+            flags = np.unpackbits(self._bits.numpy(), count=self.total, bitorder="little")
+            return torch.from_numpy(np.flatnonzero(flags))
         mask = (self._bits[:, None] >> _bit_positions(self._bits.device)).bitwise_and_(1).view(-1)[: self.total]
         return torch.nonzero_static(mask, size=self.count)[:, 0]
 
@@ -420,16 +416,12 @@ def _splits(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
     """Return all ways to split a piece in two: at every 16th row or column, or not at all."""
     area = piece.region
     splits = _whole(piece)
-
-    def part(region: Rectangle) -> Piece:
-        return Piece(piece.scale, piece.size, region)
-
     for row in range(area.top + ALIGNMENT, area.bottom, ALIGNMENT):  # rows first, because they are contiguous in memory
-        upper = part(Rectangle(area.top, area.left, row, area.right))
-        splits.append((upper, part(Rectangle(row, area.left, area.bottom, area.right))))
+        upper = replace(piece, region=Rectangle(area.top, area.left, row, area.right))
+        splits.append((upper, replace(piece, region=Rectangle(row, area.left, area.bottom, area.right))))
     for column in range(area.left + ALIGNMENT, area.right, ALIGNMENT):
-        left = part(Rectangle(area.top, area.left, area.bottom, column))
-        splits.append((left, part(Rectangle(area.top, column, area.bottom, area.right))))
+        left = replace(piece, region=Rectangle(area.top, area.left, area.bottom, column))
+        splits.append((left, replace(piece, region=Rectangle(area.top, column, area.bottom, area.right))))
     return splits
 
 

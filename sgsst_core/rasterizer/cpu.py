@@ -499,11 +499,9 @@ class CpuRasterizer(TiledRasterizer[TileIntersections]):
 
     def __init__(self, scene: Scene, **options: Any) -> None:
         super().__init__(scene, **options)
-        self._shapes: Shapes | None = None
+        self._shapes = Shapes.of(scene)
 
     def _build(self, camera: Camera) -> TileIntersections:
-        if self._shapes is None:
-            self._shapes = Shapes.of(self.scene)
         return build_tile_intersections(self.scene, camera, near=self.near, shapes=self._shapes)
 
     def _render(self, colors: Tensor, camera: Camera) -> Tensor:

@@ -36,6 +36,9 @@ from sgsst_core.rasterizer.cpu import check_intersections, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
+#: Compile-time constants of the compositing kernels.
+_CUTS = {"ALPHA_MAX": ALPHA_MAX, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN}
+
 
 @dataclass(frozen=True)
 class DeviceIntersections:
@@ -143,7 +146,7 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
             kernels.slot_gradients[(across * down,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, image_gradient, slots,
                 camera.width, camera.height, across,
-                **self.cuts(kernels.SUMMING_WARPS),
+                **_CUTS, num_warps=kernels.SUMMING_WARPS,
             )  # fmt: skip
         add_slots_(gradient, slots, isects.first_slots, isects.gaussians)
         return gradient
@@ -160,13 +163,9 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
             kernels.render[(across * down,)](
                 isects.ranks, isects.starts, isects.gaussians, isects.values, colors, self.background,
                 image, transmittance, camera.width, camera.height, across,
-                **self.cuts(kernels.PIXEL_WARPS),
+                **_CUTS, num_warps=kernels.PIXEL_WARPS,
             )  # fmt: skip
         return image, transmittance
-
-    def cuts(self, warps: int) -> dict[str, float | int]:
-        """Return the compile-time constants of a compositing kernel with this number of warps per program."""
-        return {"ALPHA_MAX": ALPHA_MAX, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN, "num_warps": warps}
 
     def _build(self, camera: Camera) -> DeviceIntersections:
         """Project and sort the Gaussians and compute tile intersections; synchronizes with the device once."""
@@ -263,7 +262,7 @@ class CountedPieces:
             kernels.count_pieces[(self.tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, self.masks, self.slot_pieces,
                 self.block_pieces, self.ends, *self.view,
-                **rasterizer.cuts(kernels.SUMMING_WARPS),
+                **_CUTS, num_warps=kernels.SUMMING_WARPS,
             )  # fmt: skip
         self.pieces = int(self.block_pieces.sum())
         self.index_type = torch.int32 if self.pieces < 2**31 else torch.int64
@@ -317,17 +316,13 @@ class WeightPieces:
                 isects.ranks, isects.slots, isects.starts, isects.values, isects.gaussians, counted.masks, counted.ends,
                 slot_starts, self.block_starts, self.piece_gaussians, self.piece_slots, self.weights,
                 self.transmittance, *self._view,
-                **rasterizer.cuts(kernels.PIXEL_WARPS), SCALE=self.scale,
+                **_CUTS, num_warps=kernels.PIXEL_WARPS, SCALE=self.scale,
             )  # fmt: skip
 
     @property
     def nbytes(self) -> int:
         """Size of the weights on the device in bytes."""
-        tensors = (
-            *(self.block_starts, self.piece_gaussians, self.piece_slots, self.weights),
-            *(self.first_slots, self.gaussians, self.transmittance),
-        )
-        return sum(tensor.nbytes for tensor in tensors)
+        return sum(value.nbytes for value in vars(self).values() if isinstance(value, Tensor))
 
     def render(self, colors: Tensor) -> Tensor:
         """Return the image [h, w, 3] of colors [N, 3] over the background."""
