@@ -92,7 +92,7 @@ def splat(scene: Scene, camera: Camera, *, near: float = NEAR) -> Splats:
             reach * r.sqrt(),
         ]
     )
-    # If the determinant overflows, u_scale is 0, which is finite. So test the determinant too, as `projection` does.
+    # If the determinant overflows, u_scale is 0, which is finite. So test the determinant too, as `cpu.project` does.
     usable = columns.isfinite().all(0) & det.isfinite()
     order = torch.nonzero(usable & (opacity >= ALPHA_MIN))[:, 0]
     order = order[torch.sort(centers[order, 2], stable=True).indices]
