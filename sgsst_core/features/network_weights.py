@@ -171,8 +171,6 @@ def read_state_dict(name: str, path: Path) -> dict[str, Tensor]:
     """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise WeightsError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # torch.load raises many types for a broken archive or pickle
         raise WeightsError(f"{path}: not a file of PyTorch weights ({type(error).__name__})") from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):

@@ -559,44 +559,31 @@ def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:
     return weight / (torch.where(count > 0, count, torch.inf) * channels)
 
 
-@dataclass(frozen=True)
-class ContentDifference:
-    """Difference between content features and their target on some cells.
+def content_loss(features: Tensor, content: Tensor, position_weights: Tensor | None, factor: Tensor) -> Tensor:
+    """Return the contribution of some cells to the content loss, float64 scalar.
 
-    Attributes:
-        difference: [h, w, c], float32 or float64.
-        weighted: Difference times the position weights.
-        factor: lambda_c / (n c), float64, where n is the number of positions of the view or the sum of their weights.
+    Args:
+        features: [h, w, c], features of the image.
+        content: [h, w, c], features of the content image at the same positions.
+        position_weights: [h, w]; None for equal weights.
+        factor: Result of `content_factor`.
     """
+    difference, weighted = _content_difference(features, content, position_weights)
+    # A float32 dot product over a whole view would lose digits, so rows are summed first and then added in float64.
+    return factor * (weighted * difference).sum(dim=(1, 2)).sum(dtype=torch.float64)
 
-    difference: Tensor
-    weighted: Tensor
-    factor: Tensor
 
-    @staticmethod
-    def of(
-        features: Tensor, content: Tensor, factor: Tensor, position_weights: Tensor | None = None
-    ) -> ContentDifference:
-        """Compare features of the image with those of the content image at the same positions.
+def content_gradient(features: Tensor, content: Tensor, position_weights: Tensor | None, factor: Tensor) -> Tensor:
+    """Return the gradient of `content_loss` with respect to the features, [h, w, c]."""
+    return _content_difference(features, content, position_weights)[1] * (2 * factor)
 
-        Args:
-            features: [h, w, c].
-            content: [h, w, c].
-            position_weights: [h, w]; None for equal weights.
-        """
-        precision = torch.promote_types(features.dtype, torch.float32)
-        difference = features.to(precision) - content.to(precision)
-        weighted = difference if position_weights is None else difference * position_weights[:, :, None].to(precision)
-        return ContentDifference(difference, weighted, factor)
 
-    def loss(self) -> Tensor:
-        """Return the contribution of these cells to the content loss, float64 scalar."""
-        # A float32 dot product over a whole view would lose digits, so rows are summed first and then added in float64.
-        return self.factor * (self.weighted * self.difference).sum(dim=(1, 2)).sum(dtype=torch.float64)
-
-    def gradient(self) -> Tensor:
-        """Return the gradient with respect to the features, [h, w, c]."""
-        return self.weighted * (2 * self.factor)
+def _content_difference(features: Tensor, content: Tensor, position_weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the difference [h, w, c] from the content, float32 or float64, and the same times the position weights."""
+    precision = torch.promote_types(features.dtype, torch.float32)
+    difference = features.to(precision) - content.to(precision)
+    weighted = difference if position_weights is None else difference * position_weights[:, :, None].to(precision)
+    return difference, weighted
 
 
 @dataclass(frozen=True)
@@ -634,7 +621,7 @@ class ContentTerm:
         owned = self._owned(tile, features[CONTENT_LAYER])
         if _can_be_fused(*owned[:2]):
             return self.factor * fused_content_sum(*owned)
-        return self._difference(*owned).loss()
+        return content_loss(*owned, self.factor)
 
     def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> bool | None:
         """Add the derivative of `value` with respect to a layer's features to a gradient in place.
@@ -656,7 +643,7 @@ class ContentTerm:
             relu = added.shape == gradient.shape
             fused_add_content_gradient(added, *owned, self.factor, relu=relu)
             return relu
-        added += self._difference(*owned).gradient()
+        added += content_gradient(*owned, self.factor)
         return False
 
     def _owned(self, tile: PartitionTile, features: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -665,12 +652,9 @@ class ContentTerm:
         weights = self.view.weights(CONTENT_LAYER, in_view, self.position_weights)
         return features[in_tile.slices], self.content[tile], weights
 
-    def _difference(self, features: Tensor, content: Tensor, weights: Tensor | None) -> ContentDifference:
-        return ContentDifference.of(features, content, self.factor, weights)
-
 
 def fused_content_sum(features: Tensor, content: Tensor, position_weights: Tensor | None = None) -> Tensor:
-    """Return the sum of a_p |F_p - content_p|^2 as `ContentDifference.loss` computes it, float64 scalar."""
+    """Return the sum of a_p |F_p - content_p|^2 as `content_loss` computes it, float64 scalar."""
     from sgsst_core.loss import triton_kernels as kernels
 
     launch, constants = _launch(features, content, position_weights)
@@ -692,7 +676,7 @@ def fused_add_content_gradient(
     *,
     relu: bool = False,
 ) -> None:
-    """Add `ContentDifference.gradient` to a gradient [h, w, c], and pass it through the features' ReLU if `relu`."""
+    """Add `content_gradient` to a gradient [h, w, c], and pass it through the features' ReLU if `relu`."""
     from sgsst_core.loss import triton_kernels as kernels
 
     launch, constants = _launch(features, content, position_weights)
