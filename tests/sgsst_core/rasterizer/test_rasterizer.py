@@ -28,8 +28,8 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from tests.benchmarks.stability.splat_references import assert_background, assert_close_outside_band, relative_error
 from tests.sgsst_core.rasterizer import references as independent
+from tests.sgsst_core.rasterizer.references import assert_background, assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (
     camera,
     cloud,

@@ -26,7 +26,7 @@ from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
-from tests.benchmarks.stability.splat_references import assert_background, assert_close_outside_band, relative_error
+from tests.sgsst_core.rasterizer.references import assert_background, assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (
     camera,
     cloud,
