@@ -98,7 +98,7 @@ class Cache(Generic[K, V]):
 
     Args:
         capacity: Memory budget in bytes; None for no limit.
-        size: Function that returns the size of a value in bytes; None if every call passes the size.
+        size: Function that returns the size of a value in bytes, if calls do not pass it.
         holds_latest: Whether to store the latest value in addition, if it does not fit.
 
     Attributes:
@@ -108,7 +108,7 @@ class Cache(Generic[K, V]):
     """
 
     def __init__(
-        self, capacity: int | None, size: Callable[[V], int] | None = None, *, holds_latest: bool = False
+        self, capacity: int | None, size: Callable[[V], int] = lambda value: 0, *, holds_latest: bool = False
     ) -> None:
         self.capacity = capacity
         self.values: dict[K, V] = {}
@@ -134,9 +134,7 @@ class Cache(Generic[K, V]):
                 return self._latest[1]
             self._latest = None  # free its memory before the next one is computed
             value = make()
-            if size is None:
-                assert self._size is not None
-                size = self._size(value)
+            size = self._size(value) if size is None else size
             self.sizes[key] = size
             if self.has_space(size):
                 self._store(key, value, size)

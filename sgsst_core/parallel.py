@@ -477,11 +477,9 @@ class Tiling:
 
         Tiles are as large as the memory budget allows.
         """
-        tile_size = self.tile_size
-        if tile_size is None:
-            tile_size = choose_tile_size(
-                *size, self.halo, held=self.held, working=self.working, region=region, largest=self.largest
-            )
+        tile_size = self.tile_size or choose_tile_size(
+            *size, self.halo, held=self.held, working=self.working, region=region, largest=self.largest
+        )
         return partition(*size, tile_size, self.halo, region)
 
     def cached(self, areas: Sequence[int]) -> list[bool]:

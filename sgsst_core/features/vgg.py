@@ -447,10 +447,6 @@ class FeatureNetwork:
             held += 3 * torch.finfo(self._scale.dtype).bits / 8
         return held
 
-    def working_bytes_per_pixel(self) -> float:
-        """Return the bytes per pixel that a pass needs in addition to stored activations: two tensors like relu1_1."""
-        return 2 * self.channels("relu1_1") * torch.finfo(self.dtype).bits / 8
-
 
 def _fused_convolution(x: Tensor, step: _Convolution) -> Tensor:
     """Apply convolution, bias and ReLU in one launch: [1, in, h, w] to [1, out, h, w], both channels last."""

@@ -83,15 +83,14 @@ class LossGraphs:
     is at most the memory that `can_be_captured` reserves.
 
     Args:
-        loss: Loss of a single rank, on a device that supports CUDA graphs (`can_use_graphs`).
+        loss: Loss of a single rank, since graphs cannot contain communication, on a device that supports CUDA graphs
+            (`can_use_graphs`).
 
     Attributes:
         problem: Reason why capturing failed; None if it has not failed.
     """
 
     def __init__(self, loss: SosLoss) -> None:
-        if loss.collectives.size > 1:
-            raise ValueError("a graph cannot contain communication between ranks")
         self.loss = loss
         self.problem: str | None = None
         #: Style targets by key. A key contains their `id`, which Python could reuse if they were not referenced here.

@@ -103,6 +103,7 @@ class SosLoss:
             with the same arguments.
 
     Attributes:
+        network: Feature network. Another one needs the same layers, activations of the same size, and new targets.
         targets: Builder of the targets of styles and views for this loss.
         compared: Layers whose statistics are compared.
         matched: Layers whose features are matched.
@@ -131,7 +132,8 @@ class SosLoss:
         self.timer = timer or Timer()
         self.collectives = collectives
         held = network.held_bytes_per_pixel()
-        working = network.working_bytes_per_pixel() / held
+        # Temporary memory of a pass: two tensors like relu1_1.
+        working = 2 * network.channels("relu1_1") * torch.finfo(network.dtype).bits / 8 / held
         self.tiling = Tiling(
             network.halo,
             memory / held,
@@ -146,10 +148,6 @@ class SosLoss:
         self.targets = TargetBuilder(self)
         self.compared = compared_layers(style_loss, network)
         self.matched = nearest_layers(style_loss, network.name)
-
-    def use(self, network: FeatureNetwork) -> None:
-        """Use another network with the same layers, and activations of the same size. Compute all targets again."""
-        self.network = network
 
     def halve_memory(self, pixels: int) -> None:
         """Halve the memory budget for activations, after reducing it to what views of at most `pixels` pixels need."""
@@ -189,9 +187,7 @@ class SosLoss:
             for pass_, pixel_gradient in zip(passes, gradients, strict=gradient):
                 fraction = weights[pass_.view.scale] / self.network.loss_factor
                 images.add_gradient(pass_.view.scale, pixel_gradient, fraction)
-        stacked = torch.stack(list(values.values()))
-        if self.network.loss_factor != 1:
-            stacked = stacked / self.network.loss_factor
+        stacked = torch.stack(list(values.values())) / self.network.loss_factor
         return SosResult(tuple(values), stacked, images.gradient() if gradient else None, self.weights)
 
     def _division(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Division:
@@ -335,9 +331,7 @@ def _styled_regions(style: Sequence[StyleTarget], view: ViewTarget) -> list[Styl
     """Return the regions of a view; without regions, the whole view is the only one."""
     if view.regions is None and len(style) == 1:
         return [replace(style[0], positions=view.coverage)]
-    if view.regions is None or len(view.regions) != len(style):
-        raise ValueError("the view was not prepared for the regions that the style has")
-    pairs = zip(style, view.regions, strict=True)
+    pairs = zip(style, view.regions or (), strict=True)
     return [replace(own, positions=weights) for own, weights in pairs if own.weight]
 
 

@@ -695,10 +695,9 @@ def _launch(
     height, width, channels = features.shape
     steps = (0, 0) if position_weights is None else position_weights.stride()[:2]
     numbers = (height * width, width, row_cells(features), row_cells(content), *steps)
-    block = block_of_channels(channels)
     return numbers, {
         "CHANNELS": channels,
-        "BLOCK": block,
+        "BLOCK": block_of_channels(channels),
         "P": CONTENT_POSITIONS,
         "WEIGHTED": position_weights is not None,
     }

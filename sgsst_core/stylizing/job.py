@@ -498,7 +498,7 @@ def prepare_job(
 def in_bfloat16(job: StylizationJob, step: int) -> StylizationJob:
     """Return a job whose network continues in bfloat16 from a step in which float16 has overflowed."""
     network = make_network(job.weights, job.settings, "bfloat16", job.plan.device)
-    job.loss.use(network)
+    job.loss.network = network
     job.view_targets.forget_division()
     if job.graphs is not None:
         job.graphs.clear()

@@ -223,7 +223,7 @@ def stylize_each(collectives: Collectives) -> list[dict[str, Any]]:
             JobInputs(*inputs, weights=weights),
             collectives=collectives,
         )
-        exact.loss.use(FeatureNetwork(weights, job.network.layers, torch.float64))
+        exact.loss.network = FeatureNetwork(weights, job.network.layers, torch.float64)
         other = Stylizer(replace(exact, network=exact.loss.network))
         other.sh_dc = torch.nn.Parameter(torch.roll(other.sh_dc.detach(), 1, dims=0).double())
         other.latest = views = list(range(count))
