@@ -7,7 +7,6 @@ the blend weights and T_final is the final transmittance. The gradient with resp
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import torch
@@ -195,7 +194,7 @@ class TiledRasterizer(Rasterizer, Generic[L]):
     def __init__(self, scene: Scene, *, max_intersection_bytes: int | None = None, **common: Any) -> None:
         super().__init__(scene, max_intersection_bytes=max_intersection_bytes, **common)
         budget = self.default_intersection_bytes if max_intersection_bytes is None else max_intersection_bytes
-        self._intersections: Cache[CameraKey, L] = Cache(budget, attrgetter("nbytes"), holds_latest=True)
+        self._intersections: Cache[CameraKey, L] = Cache(budget, holds_latest=True)
 
     @classmethod
     def options(cls, memory: int) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import Cache, content_fraction, tensor_bytes
+from sgsst_core.budget import Cache, content_fraction
 from sgsst_core.devices import Timer
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.files.images import Color
@@ -50,7 +50,7 @@ class ViewColors:
         self._degree = scene.sh_degree
         self._sh_rest = scene.sh_rest.to(device)
         self._means = scene.means.to(device)
-        self.cache: Cache[int, Tensor] = Cache(memory, tensor_bytes)
+        self.cache: Cache[int, Tensor] = Cache(memory)
 
     def __call__(self, index: int, sh_dc: Tensor) -> Tensor:
         """Return the colors [N, 3] of a view for `sh_dc` [N, 3]."""
@@ -508,4 +508,4 @@ def _image_bytes(view: ScaledView) -> int:
 
 
 def _pyramid_bytes(pyramid: list[Tensor]) -> int:
-    return sum(map(tensor_bytes, pyramid))
+    return sum(level.nbytes for level in pyramid)
