@@ -19,7 +19,6 @@ reduced to reading W from memory. Weights are stored on the device that applies 
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -413,7 +412,6 @@ class CachedRasterizer(Rasterizer):
         self.min_intersection_bytes = min_intersection_bytes
         self._at_first_use = at_first_use
         self._cached: Cache[CameraKey, WeightPieces] = Cache(max_bytes)
-        self._lock = threading.Lock()
 
     @classmethod
     def options(cls, memory: int) -> dict[str, Any]:
@@ -431,10 +429,8 @@ class CachedRasterizer(Rasterizer):
         The first call for a view decides whether its weights fit; later calls do not reconsider this.
         """
         key = camera_key(camera)
-        with self._lock:
-            if key not in self._cached:
-                self._cached.add(key, lambda: self._counted(camera))
-            return key in self._cached
+        self._cached.add(key, lambda: self._counted(camera))
+        return key in self._cached
 
     @property
     def caches(self) -> dict[str, Cache[CameraKey, Any]]:
