@@ -99,10 +99,6 @@ class Collectives:
         """Return the sum over all ranks, identical on all ranks. The argument may be overwritten."""
         return tensor
 
-    def union(self, mask: Tensor) -> Tensor:
-        """Return the elementwise OR of all ranks' masks [n] bool, identical on all ranks."""
-        return mask
-
     def all_reduce_statistics(
         self, parts: Sequence[LayerStatistics], numbers: Tensor
     ) -> tuple[list[LayerStatistics], Tensor]:

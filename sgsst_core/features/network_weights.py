@@ -39,7 +39,7 @@ from sgsst_core.features.weight_files import (
     VGG19_DIGEST,
     cache_folder,
     damage_of,
-    digest_of_bytes,
+    digest_of,
     is_genuine,
     source_of,
     verify,
@@ -219,10 +219,9 @@ class _ArrayUnpickler(pickle.Unpickler):
     }
 
     def find_class(self, module: str, name: str) -> Any:
-        try:
-            return self._ALLOWED[module, name]
-        except KeyError:
-            raise pickle.UnpicklingError(f"{module}.{name} is not allowed") from None
+        if (module, name) not in self._ALLOWED:
+            raise pickle.UnpicklingError(f"{module}.{name} is not allowed")
+        return self._ALLOWED[module, name]
 
 
 def unpickle_arrays(data: bytes) -> dict[str, np.ndarray]:
@@ -525,7 +524,7 @@ def _install(folder: Path, converted: Mapping[str, Mapping[str, Tensor]], source
     for name, tensors in converted.items():
         metadata = {"name": name, "source": source, "source_sha256": source_digest}
         # The digest is stored in the header of the file itself, so that one atomic rename publishes both.
-        metadata["sha256"] = digest_of_bytes(safetensors.torch.save(dict(tensors), metadata))
+        metadata["sha256"] = digest_of(io.BytesIO(safetensors.torch.save(dict(tensors), metadata)))[0]
         if not is_genuine(name, metadata):
             raise WeightsError(
                 f"{source}: the converted weights of {name} are not those that were published. Try again."

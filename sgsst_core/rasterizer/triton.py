@@ -191,8 +191,7 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
                     SUPPORT=-LOG2_ALPHA_MIN, POWER=TO_POWER_OF_TWO, BLOCK=block,
                 )  # fmt: skip
         ordered, order = torch.sort(depths, stable=True)
-        first_slots = torch.zeros(count + 1, dtype=torch.int64, device=self.device)
-        torch.cumsum(counts[order], 0, out=first_slots[1:])
+        first_slots = _offsets(counts[order], torch.int64)
         visible, total = torch.stack([ordered.isfinite().sum(), first_slots[-1]]).tolist()
         check_intersections(total, visible, camera)
         order, first_slots = order[:visible].clone(), first_slots[: visible + 1].clone()

@@ -222,7 +222,7 @@ class Views:
                     ones = torch.ones((camera.height, camera.width, 3))
                     mask = self.rasterizer.color_gradient(ones, camera)[:, 0] > 0
             with self.timer("communication"):
-                return ShownGaussians(self.collectives.union(mask))
+                return ShownGaussians(self.collectives.all_reduce(mask.int()) > 0)
 
         return self._shown.get(index, find, size)
 

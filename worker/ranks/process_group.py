@@ -272,16 +272,9 @@ class ProcessGroupCollectives(Collectives):
 
     def all_reduce(self, tensor: Tensor) -> Tensor:
         """See `Collectives`."""
-        return self._reduce(tensor, dist.ReduceOp.SUM)
-
-    def union(self, mask: Tensor) -> Tensor:
-        """See `Collectives`."""
-        return self._reduce(mask.to(torch.uint8), dist.ReduceOp.MAX).bool()
-
-    def _reduce(self, tensor: Tensor, operation: Any) -> Tensor:
         tensor = tensor.contiguous()
         with WAITING:
-            dist.all_reduce(tensor, operation, group=self._group)
+            dist.all_reduce(tensor, group=self._group)
         return tensor
 
     def all_reduce_statistics(

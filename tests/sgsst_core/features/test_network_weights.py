@@ -32,7 +32,7 @@ from sgsst_core.features.weight_files import (
     PACKAGE_SOURCE,
     cache_folder,
     damaged_weights,
-    digest_of_bytes,
+    digest_of,
     verify,
 )
 from tests.networks import flip_a_bit
@@ -324,7 +324,7 @@ def test_forged_package_weights_are_refused(folder: Path) -> None:
     with safetensors.safe_open(path, "pt") as file:
         metadata: dict[str, str] = file.metadata()
     del metadata["sha256"]
-    metadata["sha256"] = digest_of_bytes(safetensors.torch.save(tensors, metadata))
+    metadata["sha256"] = digest_of(io.BytesIO(safetensors.torch.save(tensors, metadata)))[0]
     path.write_bytes(safetensors.torch.save(tensors, metadata))
     assert "checksum" in damaged_weights(folder)[0]
     with pytest.raises(WeightsError, match="not those that were published"):

@@ -393,4 +393,4 @@ def test_exchange_of_shown_gaussians_is_bit_identical_to_all(scene: Scene, heigh
             assert torch.equal(whole, packed)
             assert torch.equal(packed, first)
         assert result["bytes whole"] == [12 * len(scene)] * 2
-        assert result["bytes shown"] == [12 * shown] * 2
+        assert result["bytes shown"] == [4 * len(scene), 12 * shown, 12 * shown]
