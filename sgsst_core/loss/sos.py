@@ -181,9 +181,9 @@ class SosLoss:
         values: dict[int, Tensor] = {}
         for some in rounds(list(sizes), self.collectives.size):
             passes = [self._pass(images.scaled(scale), division.tiles[scale], style[scale], view) for scale in some]
-            cached = self._collect(passes, cache=gradient)
+            self._collect(passes, cache=gradient)
             values |= {pass_.view.scale: pass_.values for pass_ in passes}
-            gradients = self._backward(passes, cached) if gradient else []
+            gradients = self._backward(passes) if gradient else []
             for pass_, pixel_gradient in zip(passes, gradients, strict=gradient):
                 fraction = weights[pass_.view.scale] / self.network.loss_factor
                 images.add_gradient(pass_.view.scale, pixel_gradient, fraction)
@@ -207,20 +207,15 @@ class SosLoss:
             terms.append(NearestTerm.of(scaled, self.network, self._style_loss, regions, self.timer))
         return _ScalePass(scaled, tiles, StatisticsTerms(scaled, self.network, regions, self.compared), terms)
 
-    def _collect(self, passes: Sequence[_ScalePass], *, cache: bool) -> list[dict[PartitionTile, Activations]]:
+    def _collect(self, passes: Sequence[_ScalePass], *, cache: bool) -> None:
         """Run the first pass of some scales, and set the values of their terms.
 
         The ranks' statistics of all these scales are merged together, so that ranks wait for each other only once.
-
-        Returns:
-            Cached activations of each scale.
         """
-        cached: list[dict[PartitionTile, Activations]] = []
         collected: list[list[LayerStatistics]] = []
         numbers: list[Tensor] = []
         fits = iter(self.tiling.cached([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
         for pass_ in passes:
-            cached.append({})
             statistics: list[LayerStatistics] = []
             values = dict.fromkeys(TERMS, torch.zeros((), dtype=torch.float64, device=self.network.device))
             for tile in pass_.tiles:
@@ -232,7 +227,7 @@ class SosLoss:
                     for term in pass_.terms:
                         values[term.name] = values[term.name] + term.value(tile, activations.features)
                 if cache_this:
-                    cached[-1][tile] = activations
+                    pass_.cached[tile] = activations
             collected.append(statistics or pass_.statistics.zero())
             numbers += values.values()
         with self.timer("communication"):
@@ -244,23 +239,19 @@ class SosLoss:
                 compared = pass_.statistics.compare([next(parts) for _ in own])
                 values = dict(zip(TERMS, added.unbind(), strict=True)) | compared
                 pass_.values = torch.stack(list(values.values()))
-        return cached
 
-    def _backward(
-        self, passes: Sequence[_ScalePass], cached: Sequence[dict[PartitionTile, Activations]]
-    ) -> list[Tensor]:
+    def _backward(self, passes: Sequence[_ScalePass]) -> list[Tensor]:
         """Return the gradient of each scale with respect to the pixels [h, w, 3] of its view.
 
         Tiles with cached activations are processed first, which frees memory for tiles that have to be recomputed.
         """
         dtype = torch.promote_types(self.network.dtype, torch.float32)
         results = [torch.zeros(pass_.view.image.shape, dtype=dtype, device=self.network.device) for pass_ in passes]
-        pairs = zip(passes, cached, strict=True)
-        uncached = [[tile for tile in pass_.tiles if tile not in own] for pass_, own in pairs]
-        for pass_, result, own in zip(passes, results, cached, strict=True):
-            while own:
-                tile = next(iter(own))
-                self._backward_tile(pass_, tile, own.pop(tile), result)
+        uncached = [[tile for tile in pass_.tiles if tile not in pass_.cached] for pass_ in passes]
+        for pass_, result in zip(passes, results, strict=True):
+            while pass_.cached:
+                tile = next(iter(pass_.cached))
+                self._backward_tile(pass_, tile, pass_.cached.pop(tile), result)
         for pass_, result, tiles in zip(passes, results, uncached, strict=True):
             for tile in tiles:
                 self._backward_tile(pass_, tile, self._forward(pass_, tile), result)
@@ -291,6 +282,7 @@ class _ScalePass:
 
     Attributes:
         values: [terms] float64, value of each of `TERMS`; set after the first pass.
+        cached: Activations of the first pass by tile, as far as they are cached.
     """
 
     view: ScaledView
@@ -298,6 +290,7 @@ class _ScalePass:
     statistics: StatisticsTerms
     terms: list[PositionTerm]
     values: Tensor = field(init=False)
+    cached: dict[PartitionTile, Activations] = field(default_factory=dict)
 
 
 def make_loss(
