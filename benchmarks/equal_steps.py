@@ -40,8 +40,8 @@ from sgsst_core import Stylizer, make_settings
 from sgsst_core.bench.variants import judged_row
 from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.features.vgg import with_scales
 from sgsst_core.files.scene_file import SceneFile, read_scene
-from sgsst_core.loss.feature_scale import with_scales
 from sgsst_core.quality.judge import Judge, Lpips
 from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
 from sgsst_core.rasterizer import make_rasterizer

@@ -19,8 +19,7 @@ import torch
 from benchmarks.common import parse, write_result
 from sgsst_core.bench.device_checks import surface_scene
 from sgsst_core.orbit import orbit
-from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.projection import build_tile_intersections
+from sgsst_core.rasterizer.cpu import CpuRasterizer, build_tile_intersections
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors

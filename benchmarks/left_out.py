@@ -37,7 +37,7 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.parallel.division import Divider, Division, Size, Tiling
+from sgsst_core.parallel import Divider, Division, Size, Tiling
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings

@@ -22,7 +22,7 @@ from torch import Tensor
 from benchmarks.common import parse, read_views, write_result
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.painting.solver import PaintedColors, PaintedView, paint
+from sgsst_core.painting import PaintedColors, PaintedView, paint
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
@@ -90,7 +90,7 @@ def _measure(scene: Scene, views: list[Camera], change: Callable[[Scene, Tensor]
     view = PaintedView(painted, target, torch.ones(target.shape[:2]))
     result = paint(scene, [view], rasterizer, others=spread(views, 12))
     alone = PaintedColors(scene, [view], rasterizer)
-    seen, solved = alone.weights > 0.05, alone.solve(original).colors
+    seen, solved = alone.weights > 0.05, alone.solve(original)[0]
     colors = {
         "nothing": original,
         "one map": _one_map(image(original, painted), target.double(), original),

@@ -18,7 +18,7 @@ import torch
 
 from benchmarks.common import free_address, input_parser, parse, read_inputs, with_size, write_result
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from worker.ranks.process_group import process_group
 
 RANKS, ROUNDS = 2, 3

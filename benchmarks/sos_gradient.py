@@ -24,7 +24,7 @@ from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.statistics import layer_statistics, merge
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.terms import ContentDifference, StyleTarget, StyleTargets, content_factor, style_loss
+from sgsst_core.loss.terms import StyleTarget, StyleTargets, content_factor, content_gradient, style_loss
 from sgsst_core.scales import scale_count
 from sgsst_core.scene.colors import add_upscaled_, downscale
 from sgsst_core.style import Style
@@ -124,9 +124,7 @@ def _scale(network: FeatureNetwork, image: Tensor, style: StyleTarget, content: 
 
         def pull(layer: str, features: Tensor, so_far: Tensor, wanted: Tensor = wanted) -> None:
             if layer == CONTENT_LAYER:
-                so_far += ContentDifference.of(
-                    features, wanted, content_factor(cells, features.shape[-1], 1.0)
-                ).gradient()
+                so_far += content_gradient(features, wanted, None, content_factor(cells, features.shape[-1], 1.0))
             else:
                 maps[layer].add_to(so_far, features)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable, Hashable
+from operator import attrgetter
 from typing import Generic, Literal, TypeVar
 
 import psutil
 import torch
-from torch import Tensor
 
 from sgsst_core import container
 
@@ -85,11 +85,6 @@ def device_peak(device: torch.device | str) -> int | None:
     return torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None
 
 
-def tensor_bytes(tensor: Tensor) -> int:
-    """Return the size of a tensor's values in bytes."""
-    return tensor.numel() * tensor.element_size()
-
-
 class Cache(Generic[K, V]):
     """Cache with a memory budget; values that do not fit are recomputed at each use.
 
@@ -98,7 +93,7 @@ class Cache(Generic[K, V]):
 
     Args:
         capacity: Memory budget in bytes; None for no limit.
-        size: Function that returns the size of a value in bytes; None if every call passes the size.
+        size: Function that returns the size of a value in bytes; its `nbytes` by default.
         holds_latest: Whether to store the latest value in addition, if it does not fit.
 
     Attributes:
@@ -108,7 +103,7 @@ class Cache(Generic[K, V]):
     """
 
     def __init__(
-        self, capacity: int | None, size: Callable[[V], int] | None = None, *, holds_latest: bool = False
+        self, capacity: int | None, size: Callable[[V], int] = attrgetter("nbytes"), *, holds_latest: bool = False
     ) -> None:
         self.capacity = capacity
         self.values: dict[K, V] = {}
@@ -134,9 +129,7 @@ class Cache(Generic[K, V]):
                 return self._latest[1]
             self._latest = None  # free its memory before the next one is computed
             value = make()
-            if size is None:
-                assert self._size is not None
-                size = self._size(value)
+            size = self._size(value) if size is None else size
             self.sizes[key] = size
             if self.has_space(size):
                 self._store(key, value, size)

@@ -39,8 +39,8 @@ class Timer:
         self._device = torch.device(device)
         self._open: list[str] = []
         self._whole: str | None = None
+        #: Last switch: an event on a GPU, seconds on a CPU.
         self._since: Any = None
-        self._since_clock = 0.0
         #: Name, start and end of blocks that have not been read yet.
         self._marked: list[tuple[str, Any, Any]] = []
 
@@ -64,7 +64,7 @@ class Timer:
         self.seconds.clear()
         self._marked.clear()
         if self._open:
-            self._start()
+            self._since = self._now()
 
     def lap(self) -> Timer:
         """Return a timer that has all measurements so far, to be read later, and continue with none."""
@@ -84,21 +84,18 @@ class Timer:
 
     def _switch(self) -> None:
         """Attribute the time since the last switch to the innermost open block."""
-        start, start_clock = self._since, self._since_clock
-        self._start()
-        if not self._open:
-            return
-        if self._since is None:
-            self._add(self._open[-1], self._since_clock - start_clock)
-        elif start is not None:
+        start, self._since = self._since, self._now()
+        if self._open and self._device.type == "cuda":
             self._marked.append((self._open[-1], start, self._since))
+        elif self._open:
+            self._add(self._open[-1], self._since - start)
 
-    def _start(self) -> None:
-        if self._device.type == "cuda":
-            self._since = torch.cuda.Event(enable_timing=True)
-            self._since.record()
-        else:
-            self._since_clock = time.perf_counter()
+    def _now(self) -> Any:
+        if self._device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
 
     def _add(self, name: str, seconds: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds

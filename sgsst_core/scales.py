@@ -50,15 +50,9 @@ class ScaleWeights:
         return [scale for scale in range(count) if self.of(scale) > 0]
 
     def fractions(self, scales: Iterable[int]) -> dict[int, float]:
-        """Return the weights of some scales, normalized to add up to 1.
-
-        Raises:
-            ValueError: If none of them has a positive weight.
-        """
+        """Return the weights of some scales, one of them positive, normalized to add up to 1."""
         weights = {scale: self.of(scale) for scale in scales}
         total = sum(weights.values())
-        if not total > 0:
-            raise ValueError(f"none of the scales {sorted(weights)} has a weight")
         return {scale: weight / total for scale, weight in weights.items()}
 
     def sampled(self, chosen: Sequence[int], drawn: Iterable[int], period: int) -> dict[int, float]:

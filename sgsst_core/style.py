@@ -189,18 +189,10 @@ def mixed_moments(moments: Sequence[tuple[Tensor, Tensor]], weights: Sequence[fl
     """Compute mean [c] and covariance [c, c] of a mixture from those of its components."""
     if len(moments) == 1:
         return moments[0]
-    mean = _sum([weight * own for (own, _), weight in zip(moments, weights, strict=True)])
-    covariance = _sum(
-        [
-            weight * (spread + torch.outer(own - mean, own - mean))
-            for (own, spread), weight in zip(moments, weights, strict=True)
-        ]
-    )
-    return mean, covariance
-
-
-def _sum(parts: Sequence[Tensor]) -> Tensor:
-    return torch.stack(list(parts)).sum(dim=0)
+    pairs = list(zip(moments, weights, strict=True))
+    mean = torch.stack([weight * own for (own, _), weight in pairs]).sum(dim=0)
+    spreads = [weight * (spread + torch.outer(own - mean, own - mean)) for (own, spread), weight in pairs]
+    return mean, torch.stack(spreads).sum(dim=0)
 
 
 def color_moments(colors: Tensor, weights: Tensor | None = None) -> Moments:

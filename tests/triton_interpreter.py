@@ -12,6 +12,7 @@ def prepare() -> None:
     _replace_builtins_once()
     _remember_types()
     _compute_in_bfloat16()
+    _use_large_blocks()
 
 
 def _replace_builtins_once() -> None:
@@ -124,3 +125,12 @@ def _compute_in_bfloat16() -> None:
 
     builder.create_dot = create_dot
     builder.cast_impl = cast_impl
+
+
+def _use_large_blocks() -> None:
+    """Let programs process more at a time: the time of an operation hardly depends on its size in the interpreter."""
+    from sgsst_core.features import statistics
+    from sgsst_core.loss import terms
+
+    statistics.POSITIONS = {2: 4096, 4: 4096}
+    statistics.ENTRIES, terms.POSITIONS = 1 << 18, 4096

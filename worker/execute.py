@@ -23,6 +23,7 @@ from sgsst_core import container
 from sgsst_core.devices import Timer
 from sgsst_core.errors import CheckpointError, OutputError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.features.vgg import weights_for
 from sgsst_core.files.atomic import remove_leftovers, write_json
 from sgsst_core.files.formats.sog import STREAMED_SOG
 from sgsst_core.files.images import save_jpg
@@ -33,8 +34,7 @@ from sgsst_core.files.scene_file import (
     write_scene,
     write_stylized,
 )
-from sgsst_core.loss.feature_scale import weights_for
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.facts import common_device, rasterizer_problem
 from sgsst_core.planning.plan import LOSS_VIEWS, Plan
 from sgsst_core.planning.survey import ShowPlanning

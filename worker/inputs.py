@@ -51,7 +51,7 @@ from sgsst_core.files.images import (
 )
 from sgsst_core.files.scene_file import SceneFile, read_property, read_scene
 from sgsst_core.orbit import Orbit, OrbitRequest, find_subject, find_up, make_orbit
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.facts import check_scales
 from sgsst_core.planning.plan import OPTIMIZER_BYTES
 from sgsst_core.planning.survey import (

@@ -19,7 +19,7 @@ from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.images import image_size, load_image, to_image
 from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import SceneFile, write_colors, write_stylized
-from sgsst_core.painting.solver import PASSES, Painted, PaintedView, paint
+from sgsst_core.painting import PASSES, Painted, PaintedView, paint
 from sgsst_core.progress import Decision, Progress
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.base import Color, Rasterizer

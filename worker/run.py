@@ -29,7 +29,7 @@ from worker.options import RunOptions
 from worker.processes import ProcessId, die_with_parent, listen
 
 if TYPE_CHECKING:
-    from sgsst_core.parallel.collectives import Collectives
+    from sgsst_core.parallel import Collectives
     from worker.execute import Prepared
 
 #: Seconds by which the timeout of an exchange between ranks exceeds the driver's. The driver should time out first,
@@ -230,7 +230,7 @@ def run_rank(
 
     from sgsst_core import container
     from sgsst_core.devices import seconds_left
-    from sgsst_core.parallel.collectives import ALONE
+    from sgsst_core.parallel import ALONE
     from worker.execute import Previews, describe, execute, prepare
 
     gc.enable()

@@ -12,6 +12,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -23,19 +24,23 @@ from torch import Tensor
 
 from benchmarks.common import free_address
 from benchmarks.gpu.part import QUICK, Findings, Sizes, device, network_weights
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.bench.device_checks import (
     BACKGROUND,
+    Check,
     check_device,
     different_repeats,
     make_step,
-    rasterizer_checks,
     surface_scene,
     texture,
     views,
 )
 from sgsst_core.features.vgg import has_bfloat16
-from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.rasterizer import drawing_problem, make_rasterizer
+from sgsst_core.parallel import ALONE, Collectives
+from sgsst_core.rasterizer import Rasterizer, drawing_problem, make_rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests import triton_interpreter
@@ -55,6 +60,9 @@ COLORS_BOUND = 1e-2
 #: Bound on the relative difference from the CPU's loss, for means over rounds of all views. Single losses differ more:
 #: Adam normalizes gradients, so a color whose gradient is only rounding error moves as far as any other.
 CURVE_BOUND = 1e-3
+#: Relative distance from an alpha or transmittance cutoff within which float32 rounding may change the decision, and
+#: relative error bounds for images, and for their gradients.
+CLOSE, RASTER_BOUND, RASTER_GRADIENT_BOUND = 2e-5, 1e-5, 5e-6
 VIEWS = 6
 #: Learning rate of the paper. At 0.02, an initial difference of 3e-7 in color grows to 1 % in the final loss.
 LEARNING_RATE = 2.5e-3
@@ -68,10 +76,26 @@ def parity(sizes: Sizes, findings: Findings) -> None:
         raise RuntimeError(f"rasterizer 'triton': {problem}")
     for name in ("triton", "cached"):
         rasterizer = make_rasterizer(name, scene, background=BACKGROUND, device=device())
-        for check in rasterizer_checks(rasterizer, scene, camera):
+        for check in reference_checks(rasterizer, scene, camera):
             findings.check(f"{name}/{check.name}", check.error, check.bound)
         step = make_step(rasterizer, scene, camera, network_weights(sizes))
         findings.check(f"{name}/different_of_{sizes.bits}_repeats", different_repeats(step, sizes.bits), 0.0)
+
+
+def reference_checks(fast: Rasterizer, scene: Scene, camera: Camera) -> Iterator[Check]:
+    """Compare image, coverage and color gradient with the float64 reference, except at pixels close to a cutoff."""
+    reference = ReferenceRasterizer(scene, background=BACKGROUND)
+    colors = scene_colors(scene, camera)
+    pixels = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
+    band = reference.near_cutoff(camera, CLOSE)
+    pixels[band] = 0
+    image = (fast.render(colors, camera).cpu() - reference.render(colors, camera)).abs().amax(-1)
+    yield Check("image", float(image[~band].max()) / max(1.0, float(colors.max())), RASTER_BOUND)
+    coverage = (fast.coverage(camera).cpu() - reference.coverage(camera)).abs()
+    yield Check("coverage", float(coverage[~band].max()), RASTER_BOUND)
+    expected = reference.color_gradient(pixels, camera)
+    error = float((fast.color_gradient(pixels, camera).cpu() - expected).norm() / expected.norm())
+    yield Check("gradient", error, RASTER_GRADIENT_BOUND)
 
 
 def poison(sizes: Sizes, findings: Findings) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import resource
 import sys
@@ -14,18 +15,19 @@ from functools import cache, partial
 from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import sos_reference
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import NEAR
 from sgsst_core.features.layers import winograd_pays_off
 from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeights, load_network_weights
 from sgsst_core.features.vgg import Activations, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.facts import DTYPES
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import TENSORS, Scene
@@ -365,10 +367,18 @@ class DecisionsOf(FeatureNetwork):
         """Run `FeatureNetwork.forward`; store the decisions of the next recorded pass for `backward`."""
         own = super().forward(rgb, cache=cache, until=until)
         theirs = Activations({}, self._recorded.popleft())
-        for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
+        for mine, other in zip(decisions(own), decisions(theirs), strict=True):
             self.flips += int((mine != other).sum())
         own.outputs = [output.double() for output in theirs.outputs]
         return own
+
+
+def decisions(activations: Activations) -> list[Tensor]:
+    """Return the discrete decisions of each step of a network: ReLU masks, and positions of pooling maxima."""
+    pairs = itertools.pairwise([*activations.outputs[:1], *activations.outputs])
+    return [
+        output > 0 if output.numel() else F.max_pool2d(source, 2, return_indices=True)[1] for source, output in pairs
+    ]
 
 
 class RoundedNetwork(DecisionsOf):

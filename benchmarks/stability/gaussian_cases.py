@@ -22,11 +22,12 @@ from benchmarks.stability.case import (
     repeated,
     without,
 )
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import ALPHA_MIN, NEAR, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.projection import project
+from sgsst_core.rasterizer.cpu import project
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors, view_directions
 
@@ -263,7 +264,7 @@ def _moved_world(full: bool) -> CaseResult:
     pose[:3, 3] -= pose[:3, :3] @ offset
     moved = replace(scene, means=scene.means + offset.float())
     colors = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1))
-    image = make_rasterizer("reference", scene).render(colors, view)
+    image = ReferenceRasterizer(scene).render(colors, view)
     rendered = make_rasterizer("cpu", moved).render(colors, replace(view, world_to_camera=pose)).double()
     error = float((rendered - image).abs().max()) / 2
     return CaseResult(error, 1e-4, "float32 positions step by 0.06 there; nothing is lost beyond that")

@@ -45,11 +45,10 @@ from benchmarks.stability.case import (
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SgsstError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, FeatureNetwork
-from sgsst_core.loss.feature_scale import PUBLISHED, even_scales, with_scales
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, PUBLISHED, FeatureNetwork, even_scales, with_scales
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.terms import nearest_weight
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.scales import scale_count
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import luminance

@@ -142,5 +142,5 @@ def _loss_of(size: tuple[int, int], tile_size: int | None, dtype: torch.dtype) -
     image, style, content = (texture(*size, seed).to(dtype) for seed in (1, 2, 3))
     loss = SosLoss(FeatureNetwork(vgg16(), dtype=dtype), tile_size=tile_size)
     return loss.evaluate(image, loss.targets.of_style(Style.of(style), size), loss.targets.of_view(content)), len(
-        loss.divider.tiles(size)
+        loss.tiling.tiles(size)
     )

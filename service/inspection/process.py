@@ -38,7 +38,6 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders, load_registries
 from sgsst_core.devices import seconds_left
 from sgsst_core.errors import InvalidInputError, SceneError, SettingsError, SgsstError, WeightsError
-from sgsst_core.features import kernels as feature_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.features.network_weights import list_network_weights
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.images import image_size

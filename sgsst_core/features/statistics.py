@@ -167,74 +167,50 @@ def _is_far(shift: Tensor, statistics: LayerStatistics) -> bool:
 
 
 def _statistics_about(shift: Tensor, features: Tensor, position_weights: Tensor | None) -> LayerStatistics:
-    """Compute statistics from sums about a shift [c]."""
+    """Compute statistics from sums about a shift [c] close to the mean, so that subtracting it cancels no digits.
+
+    Sums are in the shift's precision within a span, and in float64 across spans.
+    """
     channels = features.shape[-1]
-    total = _ShiftedSums(channels, shift)
+    total = LayerStatistics.zero(channels, shift.device)
+    first, second = torch.zeros_like(shift), shift.new_zeros((channels, channels))
+    # Channels per strip. Each strip is multiplied by itself and all later channels. Below the diagonal, products are
+    # computed only within diagonal blocks.
+    side = max(32, channels // 8) if shift.device.type == "cpu" else channels
+    positions = 0
     for rows, block in blocks_of(features):
         centered = center(features[rows], shift, block).reshape(-1, channels)
-        weights = None if position_weights is None else position_weights[rows].reshape(-1).to(shift.dtype)
-        total.add(centered, weights)
-    return total.statistics()
+        # `sum` adds pairwise. A matrix-vector product may add positions one by one, which loses two more digits.
+        if position_weights is None:
+            total.count.add_(len(centered))
+            first.add_(centered.sum(dim=0))
+        else:
+            weights = position_weights[rows].reshape(-1).to(shift.dtype)
+            total.count.add_(weights.sum(dtype=torch.float64))
+            # With the square root of the weights in both factors, the product is symmetric, so half of it suffices.
+            roots = weights.sqrt()
+            centered *= roots[:, None]
+            first.add_((centered * roots[:, None]).sum(dim=0))
+        for left in range(0, channels, side):
+            strip = slice(left, left + side)
+            second[strip, left:].addmm_(centered[:, strip].T, centered[:, left:])
+        positions += len(centered)
+        if positions >= SPAN_POSITIONS or rows.stop == len(features):
+            total.mean.add_(first)
+            total.centered.add_(second)
+            first.zero_()
+            second.zero_()
+            positions = 0
+    some = total.count > 0
+    offset = total.mean / torch.where(some, total.count, 1.0)
+    mean = torch.where(some, shift.double() + offset, 0.0)
+    upper = total.centered.triu()
+    return LayerStatistics(total.count, mean, upper + upper.triu(1).T - torch.outer(offset, offset) * total.count)
 
 
 def center(features: Tensor, mean: Tensor, out: Tensor) -> Tensor:
     """Subtract a mean [c] from features [n, w, c], in the precision of `out` [n, w, c], which is returned."""
     return torch.sub(features, mean, out=out) if features.dtype == out.dtype else out.copy_(features).sub_(mean)
-
-
-class _ShiftedSums:
-    """Sums about a shift close to the mean, so that subtracting the mean afterwards cancels no digits.
-
-    Sums are in the shift's precision within a span, and in float64 across spans.
-    """
-
-    def __init__(self, channels: int, shift: Tensor) -> None:
-        self.shift = shift
-        self.total = LayerStatistics.zero(channels, shift.device)
-        self._first = torch.zeros_like(shift)
-        self._second = shift.new_zeros((channels, channels))
-        #: Channels per strip. Each strip is multiplied by itself and all later channels. Below the diagonal, products
-        #: are computed only within diagonal blocks.
-        self._strip = max(32, channels // 8) if shift.device.type == "cpu" else channels
-        self._positions = 0
-
-    def add(self, centered: Tensor, position_weights: Tensor | None) -> None:
-        """Add centered positions [n, c] with weights [n]; `centered` is overwritten."""
-        if position_weights is None:
-            self.total.count.add_(centered.shape[0])
-            first = centered.sum(dim=0)
-        else:
-            self.total.count.add_(position_weights.sum(dtype=torch.float64))
-            # With the square root of the weights in both factors, the product is symmetric, so half of it suffices.
-            roots = position_weights.sqrt()
-            centered *= roots[:, None]
-            first = (centered * roots[:, None]).sum(dim=0)
-        # `sum` adds pairwise. A matrix-vector product may add positions one by one, which loses two more digits.
-        self._first.add_(first)
-        for left in range(0, centered.shape[1], self._strip):
-            strip = slice(left, left + self._strip)
-            self._second[strip, left:].addmm_(centered[:, strip].T, centered[:, left:])
-        self._positions += len(centered)
-        if self._positions >= SPAN_POSITIONS:
-            self._end_span()
-
-    def _end_span(self) -> None:
-        self.total.mean.add_(self._first)
-        self.total.centered.add_(self._second)
-        self._first.zero_()
-        self._second.zero_()
-        self._positions = 0
-
-    def statistics(self) -> LayerStatistics:
-        """Return the statistics of all positions added so far."""
-        self._end_span()
-        count, first = self.total.count, self.total.mean
-        some = count > 0
-        offset = first / torch.where(some, count, 1.0)
-        mean = torch.where(some, self.shift.double() + offset, 0.0)
-        upper = self.total.centered.triu()
-        second = upper + upper.triu(1).T
-        return LayerStatistics(count, mean, second - torch.outer(offset, offset) * count)
 
 
 # --- on a GPU ---
@@ -248,30 +224,15 @@ def span_positions(positions: int, channels: int) -> int:
     return min(max(least, 1 << max(span.bit_length() - 1, 0)), most)
 
 
-def block_of_positions(default: int) -> int:
-    """Return the number of positions per step of a program: `default`, or more in Triton's interpreter."""
-    return 4096 if _is_interpreted() else default
-
-
 def block_of_entries(channels: int) -> int:
     """Return the number of matrix entries per program, in whole rows."""
     channels = max(channels, MIN_CHANNELS)
-    return min(channels**2, 1 << 18 if _is_interpreted() else max(ENTRIES, channels))
+    return min(channels**2, max(ENTRIES, channels))
 
 
 def block_of_channels(channels: int, most: int | None = None) -> int:
     """Return the number of channels per step: all of them, or at most `most`."""
     return min(max(channels, MIN_CHANNELS), most or max(channels, MIN_CHANNELS))
-
-
-def _is_interpreted() -> bool:
-    """Return whether Triton runs in its interpreter.
-
-    The time of an operation in the interpreter hardly depends on its size, so large blocks are best.
-    """
-    import triton
-
-    return bool(triton.knobs.runtime.interpret)
 
 
 def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
@@ -287,7 +248,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     height, width, channels = features.shape
     device, positions = features.device, height * width
     span, tile = span_positions(positions, channels), block_of_channels(channels, TILE)
-    block = block_of_positions(POSITIONS[features.element_size()])
+    block = POSITIONS[features.element_size()]
     shift = None
     if features.dtype == torch.float32:
         shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1))

@@ -184,7 +184,7 @@ BLOCK = tl.constexpr(1024)
 
 @triton.jit(do_not_specialize=["width", "across", "windows"])
 def max_pool(source, out, width, across, windows, CHANNELS: tl.constexpr, MASK: tl.constexpr, BLOCK: tl.constexpr):
-    """Write the maxima of 2x2 windows, as `kernels.max_pool` does.
+    """Write the maxima of 2x2 windows, as `layers.max_pool` does.
 
     Args:
         out: [height // 2, across, CHANNELS].
@@ -207,7 +207,7 @@ def max_pool(source, out, width, across, windows, CHANNELS: tl.constexpr, MASK: 
 def max_pool_backward(
     gradient, source, out, height, width, windows, CHANNELS: tl.constexpr, MASK: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Write the gradient with respect to the ReLU's input, as `kernels.max_pool_backward` does.
+    """Write the gradient with respect to the ReLU's input, as `layers.max_pool_backward` does.
 
     Args:
         gradient: [height // 2, width // 2, CHANNELS], gradient of the maxima.

@@ -3,19 +3,27 @@
 The backward pass is written out instead of using autograd for three reasons: only the gradient with respect to the
 pixels is needed; saved activations are released as soon as they are used; and the discrete decisions (ReLU masks,
 max-pool positions) are accessible, so that tests can distinguish a decision that flips under rounding from an error.
+
+The scale of a layer's features decides how much the layer and its terms count: if its features are s times as large,
+its Gram loss is s^4 times as large, and its mean, standard deviation and content losses are s^2 times as large. The
+paper uses the original VGG19 (`vgg_conv.pth` of Gatys et al.); torchvision's networks were trained separately, and
+their layers have other scales. ReLU networks are positively homogeneous: multiplying a layer's weights by the ratio of
+its factor to the previous layer's, and its biases by its own factor, scales its features by exactly that factor. A
+factor for `PIXELS` adds the pixels themselves to the comparison, which the paper does not do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from PIL import Image
 from torch import Tensor
 
 from sgsst_core.features.layers import (
@@ -24,14 +32,15 @@ from sgsst_core.features.layers import (
     has_pixel_kernels,
     max_pool,
     max_pool_backward,
-    max_positions,
     pixel_gradient,
     relu_backward,
     transform_weight,
     winograd_pays_off,
 )
-from sgsst_core.features.network_weights import BLOCKS, BackboneWeights
+from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeights
 from sgsst_core.scene.colors import gray, gray_gradient
+from sgsst_core.settings import FeatureScale, Settings
+from sgsst_core.style import STARRY_NIGHT
 
 #: Layers whose Gram matrix, mean and standard deviation form the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")
@@ -116,11 +125,6 @@ class Activations:
     outputs: list[Tensor] = field(default_factory=list)
     size: tuple[int, int] = (0, 0)
 
-    def decisions(self) -> list[Tensor]:
-        """Return the discrete decisions of each step: ReLU masks, and positions of pooling maxima."""
-        pairs = pairwise([*self.outputs[:1], *self.outputs])
-        return [output > 0 if output.numel() else max_positions(source) for source, output in pairs]
-
 
 def use_whole_float32() -> None:
     """Disable TF32 for float32 convolutions and matrix products on GPUs.
@@ -136,13 +140,11 @@ def use_whole_float32() -> None:
 
 
 def has_tf32(device: torch.device | str) -> bool:
-    """Return whether a device supports TF32, as NVIDIA GPUs of compute capability 8.0 and above do."""
+    """Return whether a device supports TF32, as NVIDIA GPUs of compute capability 8.0 and above do.
+
+    A network may run in float16 on the same GPUs.
+    """
     return _is_nvidia(device) and torch.cuda.get_device_capability(device) >= (8, 0)
-
-
-def has_float16(device: torch.device | str) -> bool:
-    """Return whether a network may run in float16 on a device: the GPUs that support TF32 too."""
-    return has_tf32(device)
 
 
 def has_bfloat16(device: torch.device | str) -> bool:
@@ -445,10 +447,6 @@ class FeatureNetwork:
             held += 3 * torch.finfo(self._scale.dtype).bits / 8
         return held
 
-    def working_bytes_per_pixel(self) -> float:
-        """Return the bytes per pixel that a pass needs in addition to stored activations: two tensors like relu1_1."""
-        return 2 * self.channels("relu1_1") * torch.finfo(self.dtype).bits / 8
-
 
 def _fused_convolution(x: Tensor, step: _Convolution) -> Tensor:
     """Apply convolution, bias and ReLU in one launch: [1, in, h, w] to [1, out, h, w], both channels last."""
@@ -474,7 +472,7 @@ def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
     """
     expected = F.conv2d(x, step.weight, step.bias, padding=1).relu_()
     largest = float(expected.amax())  # none is negative
-    _leave_nan(expected)
+    torch.full_like(expected, torch.nan)  # fills memory that the allocator reuses for the next tensor of this size
     try:
         output = _fused_convolution(x, step)
     except RuntimeError:  # cuDNN has no engine for it
@@ -484,6 +482,105 @@ def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
     return output if same_layout and difference <= _TRIAL_TOLERANCE * largest else None
 
 
-def _leave_nan(like: Tensor) -> None:
-    """Fill memory that the allocator reuses for the next tensor of this size with NaN."""
-    torch.full_like(like, torch.nan)
+#: Factor of every layer except the first, for feature scale `even`. With this factor, Gram matrix, mean and standard
+#: deviation contribute about equally to the loss at the start of a job.
+EVEN_SCALE = 8.0
+#: Factor of the first layer, for `even`. Only this layer responds to color directly. With `EVEN_SCALE`, it would
+#: contribute less than 1 % of the loss. The larger factor brings colors closer to the style image without degrading the
+#: match of other style features (docs/quality.md).
+EVEN_COLOR_SCALE = 16.0
+#: Factor of the pixels, for `even`. Without it, colors that initially match the style drift away in favor of brush
+#: strokes. On six pairs of scene and style, it reduces the color distance by 3 to 16 levels of 8 bits, and degrades the
+#: style measure by up to 0.02 (docs/quality.md).
+EVEN_PIXEL_SCALE = 28.0
+#: Losses that the original VGG19 logs in the first iteration of a published run (installation guide of J. Johnson's
+#: "neural-style", default images at 512 pixels), divided by that run's weights of 100 and 5. The run starts from noise
+#: to which the network hardly responds. For style layers, the loss is the mean squared difference between Gram matrices
+#: / (c h w) of the noise and of a painting. For the content layer, it is the mean squared difference between features
+#: of the noise and of a photo.
+PUBLISHED = {
+    "relu1_1": 300.2129,
+    "relu2_1": 7003.4956,
+    "relu3_1": 1530.3320,
+    "relu4_1": 124046.3516,
+    "relu4_2": 418235.7188,
+    "relu5_1": 6.568603,
+}
+#: Longer side in pixels of the images in the published run.
+_PUBLISHED_SIDE = 512
+
+
+def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
+    """Return the network with its features scaled as requested.
+
+    Networks that are already scaled, and `vgg_conv.pth`, which is the paper's own network and has an input range of 0
+    to 255 without normalization, are returned unchanged.
+    """
+    if weights.scales or bool((weights.input_scale == 255).all()):
+        return weights
+    return with_scales(weights, paper_scales(weights) if scale == "paper" else even_scales(weights))
+
+
+def weights_for(weights: BackboneWeights, settings: Settings) -> BackboneWeights:
+    """Return the network for a job's settings.
+
+    Its features are scaled to the feature scale, and its input is luminance if the job preserves chroma.
+    """
+    scaled = at_scale(weights, settings.feature_scale)
+    return replace(scaled, gray=True) if settings.preserve_colors == "luminance" else scaled
+
+
+def even_scales(weights: BackboneWeights) -> dict[str, float]:
+    """Return the layer factors for feature scale `even`.
+
+    Except for `PIXELS`, factors are powers of two, so scaling adds no rounding error.
+    """
+    layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
+    return {**dict.fromkeys(layers, EVEN_SCALE), layers[0]: EVEN_COLOR_SCALE, PIXELS: EVEN_PIXEL_SCALE}
+
+
+def paper_scales(weights: BackboneWeights) -> dict[str, float]:
+    """Return the layer factors with which The Starry Night produces the published losses.
+
+    Factors are rounded to two digits, which makes no visible difference. The published run used another painting; two
+    other paintings give factors within 25 % of these.
+    """
+    with Image.open(STARRY_NIGHT) as painting:
+        size = [round(side * _PUBLISHED_SIDE / max(painting.size)) for side in painting.size]
+        small = painting.convert("RGB").resize((size[0], size[1]), Image.Resampling.LANCZOS)
+    pixels = torch.from_numpy(np.array(small, dtype=np.float32)) / 255
+    nothing = (torch.tensor(CAFFE_MEAN) / 255).expand(pixels.shape)
+    network = FeatureNetwork(weights, tuple(PUBLISHED), torch.float32)
+    features, of_nothing = (network.forward(image, cache=False).features for image in (pixels, nothing))
+
+    def gram(values: Tensor) -> Tensor:
+        flat = values.flatten(0, 1).double()
+        return flat.T @ flat / flat.numel()
+
+    scales = {}
+    for layer, published in PUBLISHED.items():
+        if layer == CONTENT_LAYER:
+            factor = (published / float((features[layer] - of_nothing[layer]).square().mean())) ** (1 / 2)
+        else:
+            difference = gram(features[layer]) - gram(of_nothing[layer])
+            factor = (published / float(difference.square().mean())) ** (1 / 4)
+        scales[layer] = float(f"{factor:.2g}")
+    return scales
+
+
+def with_scales(weights: BackboneWeights, scales: Mapping[str, float]) -> BackboneWeights:
+    """Return the network with the features of some layers multiplied by a factor.
+
+    A layer without a factor uses the factor of the preceding layer. `PIXELS` has no preceding layer, and is compared
+    only if it has a factor of its own.
+    """
+    convolutions: dict[str, tuple[Tensor, Tensor]] = {}
+    before = 1.0
+    for layer, (weight, bias) in weights.convolutions.items():
+        factor = scales.get(layer.replace("conv", "relu"), before)
+        convolutions[layer] = (
+            weight if factor == before else (weight.double() * (factor / before)).float(),
+            (bias.double() * factor).float(),
+        )
+        before = factor
+    return replace(weights, convolutions=convolutions, scales=dict(scales))

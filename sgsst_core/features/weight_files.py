@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import sys
@@ -146,11 +145,6 @@ def source_of(path: Path) -> str:
             return str(read_header(stream)["__metadata__"]["source"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return "unknown (corrupt file)"
-
-
-def digest_of_bytes(content: bytes) -> str:
-    """Compute the digest of a safetensors file's contents; see `digest_of`."""
-    return digest_of(io.BytesIO(content))[0]
 
 
 def cache_folder() -> Path:

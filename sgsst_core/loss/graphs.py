@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from sgsst_core.devices import Timer
-from sgsst_core.features.partition import PartitionTile
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.terms import TERMS, StyleTargets, ViewTarget
-from sgsst_core.parallel.division import Division, Tiling
+from sgsst_core.parallel import Tiling
 
 #: Maximum number of cached graphs. Each takes about 1 MB, in addition to the memory pool that all graphs share.
 MAX_GRAPHS = 256
@@ -46,21 +45,10 @@ def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
     return 2 * max(areas, default=0) * (1 + tiling.working) <= tiling.held
 
 
-@dataclass(frozen=True)
-class _Key:
-    """Cache key of a graph: all properties that must match for a replay. `style` is the `id` of the style targets.
-
-    `weights` are those of the scales in the gradient; empty for the loss's own.
-    """
-
-    size: tuple[int, ...]
-    dtype: torch.dtype
-    tiles: tuple[tuple[int, PartitionTile], ...]
-    weights: tuple[float, ...]
-    coverage: tuple[int, ...] | None
-    regions: int
-    content_weights: bool
-    style: int
+#: Cache key of a graph: all properties that must match for a replay, among them the `id` of the style targets.
+_Key = tuple[object, ...]
+#: Scales to evaluate, or their weights in the gradient; see `SosLoss.evaluate`.
+_Scales = Sequence[int] | Mapping[int, float]
 
 
 @dataclass(frozen=True)
@@ -95,15 +83,14 @@ class LossGraphs:
     is at most the memory that `can_be_captured` reserves.
 
     Args:
-        loss: Loss of a single rank, on a device that supports CUDA graphs (`can_use_graphs`).
+        loss: Loss of a single rank, since graphs cannot contain communication, on a device that supports CUDA graphs
+            (`can_use_graphs`).
 
     Attributes:
         problem: Reason why capturing failed; None if it has not failed.
     """
 
     def __init__(self, loss: SosLoss) -> None:
-        if loss.collectives.size > 1:
-            raise ValueError("a graph cannot contain communication between ranks")
         self.loss = loss
         self.problem: str | None = None
         #: Style targets by key. A key contains their `id`, which Python could reuse if they were not referenced here.
@@ -124,9 +111,7 @@ class LossGraphs:
         self._static.clear()
         self._visited.clear()
 
-    def evaluate(
-        self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: Sequence[int] | Mapping[int, float]
-    ) -> SosResult:
+    def evaluate(self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: _Scales) -> SosResult:
         """Evaluate the loss and its gradient, as `SosLoss.evaluate` does.
 
         The next evaluation overwrites the image gradient of the result. `style` must never be changed in place.
@@ -136,7 +121,7 @@ class LossGraphs:
         if graph is None and key in self._visited and self.problem is None and len(self._graphs) < MAX_GRAPHS:
             assert key is not None
             try:
-                graph = self._graphs[key] = self._capture(key, image, style, view)
+                graph = self._graphs[key] = self._capture(image, style, view, scales)
             except Exception as error:  # any failure falls back to eager mode
                 self.problem = f"{type(error).__name__}: {error}"
                 self._graphs.clear()
@@ -148,9 +133,7 @@ class LossGraphs:
         with self.loss.timer("network"):
             return graph.replay(image, view)
 
-    def _key(
-        self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: Sequence[int] | Mapping[int, float]
-    ) -> _Key | None:
+    def _key(self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: _Scales) -> _Key | None:
         """Return the graph key of an evaluation; None if the evaluation cannot be captured."""
         division = view.division
         if division is None or division.tiles.keys() != set(scales):
@@ -163,15 +146,11 @@ class LossGraphs:
         coverage = tuple(view.coverage[0].shape) if view.coverage else None
         weights = tuple(scales.values()) if isinstance(scales, Mapping) else ()
         regions, weighted = len(view.regions or ()), view.content_weights is not None
-        return _Key(tuple(image.shape), image.dtype, tiles, weights, coverage, regions, weighted, id(style))
+        return tuple(image.shape), image.dtype, tiles, weights, coverage, regions, weighted, id(style)
 
-    def _capture(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph:
+    def _capture(self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: _Scales) -> _Graph:
         loss, device = self.loss, self.loss.network.device
-        scales = [scale for scale, _ in key.tiles]
-        weighted: Sequence[int] | Mapping[int, float] = scales
-        if key.weights:
-            weighted = dict(zip(scales, key.weights, strict=True))
-        static_image, static_view = self._static_inputs(key, image, view)
+        static_image, static_view = self._static_tensor("image", image), self._static_view(view, scales)
         values = torch.empty((len(scales), len(TERMS)), dtype=torch.float64, device=device)
         dtype = torch.promote_types(loss.network.dtype, torch.float32)
         gradient = self._static_tensor("gradient", torch.empty(image.shape, dtype=dtype, device=device))
@@ -184,7 +163,7 @@ class LossGraphs:
                 torch.cuda.stream(self._stream),
                 torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"),
             ):
-                result = loss.evaluate(static_image, style, static_view, weighted)
+                result = loss.evaluate(static_image, style, static_view, scales)
                 assert result.image_gradient is not None
                 # Copy to memory that other graphs do not reuse for activations.
                 values.copy_(result.values)
@@ -193,26 +172,24 @@ class LossGraphs:
             loss.timer = timer
         return _Graph(graph, static_image, static_view, SosResult(result.scales, values, gradient, result.weights))
 
-    def _static_inputs(self, key: _Key, image: Tensor, view: ViewTarget) -> tuple[Tensor, ViewTarget]:
-        """Return uninitialized static tensors that match an image and its view's targets in shape, layout and dtype."""
+    def _static_view(self, view: ViewTarget, scales: _Scales) -> ViewTarget:
+        """Return uninitialized static tensors that match a view's targets in shape, layout and dtype."""
+
+        def pyramid(name: str, levels: list[Tensor]) -> list[Tensor]:
+            return [self._static_tensor((name, k), level) for k, level in enumerate(levels)]
+
         content = {
-            scale: {tile: self._static_tensor(("content", scale), view.content[scale][tile])}
-            for scale, tile in key.tiles
+            scale: {tile: self._static_tensor(("content", scale), own) for tile, own in view.content[scale].items()}
+            for scale in scales
             if scale in view.content
         }
-        coverage = view.coverage and [
-            self._static_tensor(("coverage", k), level) for k, level in enumerate(view.coverage)
-        ]
-        regions = view.regions and [
-            [self._static_tensor(("region", number, k), level) for k, level in enumerate(pyramid)]
-            for number, pyramid in enumerate(view.regions)
-        ]
-        content_weights = view.content_weights and [
-            self._static_tensor(("content weights", k), level) for k, level in enumerate(view.content_weights)
-        ]
-        division = Division({}, {scale: [tile] for scale, tile in key.tiles})
-        static_view = ViewTarget(content, coverage, division, regions, content_weights)
-        return self._static_tensor("image", image), static_view
+        return replace(
+            view,
+            content=content,
+            coverage=view.coverage and pyramid("coverage", view.coverage),
+            regions=view.regions and [pyramid(f"region {n}", own) for n, own in enumerate(view.regions)],
+            content_weights=view.content_weights and pyramid("content weights", view.content_weights),
+        )
 
     def _static_tensor(self, name: object, like: Tensor) -> Tensor:
         """Return a tensor at a fixed address. Graphs share it if its name, shape, layout and dtype are the same."""

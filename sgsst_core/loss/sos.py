@@ -21,26 +21,27 @@ from sgsst_core.features.statistics import LayerStatistics, layer_statistics, me
 from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork, layer_stride
 from sgsst_core.loss.terms import (
     MAX_VECTORS,
-    POSITION_TERMS,
     TERMS,
     ContentFeatures,
+    ContentTerm,
     LayerTarget,
     LossTerms,
+    NearestTerm,
     PositionTerm,
     StatisticsTerms,
     StyleTarget,
     StyleTargets,
     StyleVectors,
-    TermInputs,
     ViewTarget,
     compared_layers,
     nearest_layers,
     positions_in,
     positions_per_image,
 )
-from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.parallel.division import (
+from sgsst_core.parallel import (
+    ALONE,
     RENDERING,
+    Collectives,
     Divider,
     Division,
     Piece,
@@ -100,6 +101,12 @@ class SosLoss:
         timer: Timer for `vgg_forward`, `vgg_backward`, `statistics`, `matching` and `communication`.
         collectives: Collectives of the ranks that evaluate each view together. All ranks must call the same methods
             with the same arguments.
+
+    Attributes:
+        network: Feature network. Another one needs the same layers, activations of the same size, and new targets.
+        targets: Builder of the targets of styles and views for this loss.
+        compared: Layers whose statistics are compared.
+        matched: Layers whose features are matched.
     """
 
     def __init__(
@@ -121,10 +128,12 @@ class SosLoss:
         self._style_loss = style_loss
         self.memory = memory
         self.weights = scales
+        self.style_scale = style_scale
         self.timer = timer or Timer()
         self.collectives = collectives
         held = network.held_bytes_per_pixel()
-        working = network.working_bytes_per_pixel() / held
+        # Temporary memory of a pass: two tensors like relu1_1.
+        working = 2 * network.channels("relu1_1") * torch.finfo(network.dtype).bits / 8 / held
         self.tiling = Tiling(
             network.halo,
             memory / held,
@@ -136,20 +145,9 @@ class SosLoss:
             RENDERING[network.device.type],
         )
         self.divider = Divider(self.tiling, collectives)
-        self.targets = TargetBuilder(
-            network,
-            self.divider,
-            self.timer,
-            collectives,
-            style_loss=style_loss,
-            has_content=content_weight > 0,
-            style_scale=style_scale,
-        )
-        self._compared = compared_layers(style_loss, network)
-
-    def use(self, network: FeatureNetwork) -> None:
-        """Use another network with the same layers, and activations of the same size. Compute all targets again."""
-        self.network = self.targets.network = network
+        self.targets = TargetBuilder(self)
+        self.compared = compared_layers(style_loss, network)
+        self.matched = nearest_layers(style_loss, network.name)
 
     def halve_memory(self, pixels: int) -> None:
         """Halve the memory budget for activations, after reducing it to what views of at most `pixels` pixels need."""
@@ -183,15 +181,13 @@ class SosLoss:
         values: dict[int, Tensor] = {}
         for some in rounds(list(sizes), self.collectives.size):
             passes = [self._pass(images.scaled(scale), division.tiles[scale], style[scale], view) for scale in some]
-            cached = self._collect(passes, cache=gradient)
+            self._collect(passes, cache=gradient)
             values |= {pass_.view.scale: pass_.values for pass_ in passes}
-            gradients = self._backward(passes, cached) if gradient else []
+            gradients = self._backward(passes) if gradient else []
             for pass_, pixel_gradient in zip(passes, gradients, strict=gradient):
                 fraction = weights[pass_.view.scale] / self.network.loss_factor
                 images.add_gradient(pass_.view.scale, pixel_gradient, fraction)
-        stacked = torch.stack(list(values.values()))
-        if self.network.loss_factor != 1:
-            stacked = stacked / self.network.loss_factor
+        stacked = torch.stack(list(values.values())) / self.network.loss_factor
         return SosResult(tuple(values), stacked, images.gradient() if gradient else None, self.weights)
 
     def _division(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Division:
@@ -204,42 +200,22 @@ class SosLoss:
     def _pass(
         self, scaled: ScaledView, tiles: list[PartitionTile], style: Sequence[StyleTarget], view: ViewTarget
     ) -> _ScalePass:
-        inputs = TermInputs(
-            scaled,
-            self.network,
-            self._style_loss,
-            self.content_weight,
-            _styled_regions(style, view),
-            self._content(view, scaled.scale),
-            view.coverage,
-            view.content_weights,
-            self.timer,
-        )
-        terms = [term.of(inputs) for term in POSITION_TERMS]
-        statistics = StatisticsTerms(inputs, self._compared)
-        return _ScalePass(scaled, tiles, statistics, [term for term in terms if term is not None])
+        regions, terms = _styled_regions(style, view), list[PositionTerm]()
+        if self.content_weight:
+            terms.append(ContentTerm.of(scaled, self.network, self.content_weight, view))
+        if self.matched and any(region.vectors is not None for region in regions):
+            terms.append(NearestTerm.of(scaled, self.network, self._style_loss, regions, self.timer))
+        return _ScalePass(scaled, tiles, StatisticsTerms(scaled, self.network, regions, self.compared), terms)
 
-    def _content(self, view: ViewTarget, scale: int) -> ContentFeatures | None:
-        if not self.content_weight:
-            return None
-        if scale not in view.content:
-            raise ValueError("the view was prepared without content, but content_weight is not 0")
-        return view.content[scale]
-
-    def _collect(self, passes: Sequence[_ScalePass], *, cache: bool) -> list[dict[PartitionTile, Activations]]:
+    def _collect(self, passes: Sequence[_ScalePass], *, cache: bool) -> None:
         """Run the first pass of some scales, and set the values of their terms.
 
         The ranks' statistics of all these scales are merged together, so that ranks wait for each other only once.
-
-        Returns:
-            Cached activations of each scale.
         """
-        cached: list[dict[PartitionTile, Activations]] = []
         collected: list[list[LayerStatistics]] = []
         numbers: list[Tensor] = []
         fits = iter(self.tiling.cached([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
         for pass_ in passes:
-            cached.append({})
             statistics: list[LayerStatistics] = []
             values = dict.fromkeys(TERMS, torch.zeros((), dtype=torch.float64, device=self.network.device))
             for tile in pass_.tiles:
@@ -251,7 +227,7 @@ class SosLoss:
                     for term in pass_.terms:
                         values[term.name] = values[term.name] + term.value(tile, activations.features)
                 if cache_this:
-                    cached[-1][tile] = activations
+                    pass_.cached[tile] = activations
             collected.append(statistics or pass_.statistics.zero())
             numbers += values.values()
         with self.timer("communication"):
@@ -263,23 +239,19 @@ class SosLoss:
                 compared = pass_.statistics.compare([next(parts) for _ in own])
                 values = dict(zip(TERMS, added.unbind(), strict=True)) | compared
                 pass_.values = torch.stack(list(values.values()))
-        return cached
 
-    def _backward(
-        self, passes: Sequence[_ScalePass], cached: Sequence[dict[PartitionTile, Activations]]
-    ) -> list[Tensor]:
+    def _backward(self, passes: Sequence[_ScalePass]) -> list[Tensor]:
         """Return the gradient of each scale with respect to the pixels [h, w, 3] of its view.
 
         Tiles with cached activations are processed first, which frees memory for tiles that have to be recomputed.
         """
         dtype = torch.promote_types(self.network.dtype, torch.float32)
         results = [torch.zeros(pass_.view.image.shape, dtype=dtype, device=self.network.device) for pass_ in passes]
-        pairs = zip(passes, cached, strict=True)
-        uncached = [[tile for tile in pass_.tiles if tile not in own] for pass_, own in pairs]
-        for pass_, result, own in zip(passes, results, cached, strict=True):
-            while own:
-                tile = next(iter(own))
-                self._backward_tile(pass_, tile, own.pop(tile), result)
+        uncached = [[tile for tile in pass_.tiles if tile not in pass_.cached] for pass_ in passes]
+        for pass_, result in zip(passes, results, strict=True):
+            while pass_.cached:
+                tile = next(iter(pass_.cached))
+                self._backward_tile(pass_, tile, pass_.cached.pop(tile), result)
         for pass_, result, tiles in zip(passes, results, uncached, strict=True):
             for tile in tiles:
                 self._backward_tile(pass_, tile, self._forward(pass_, tile), result)
@@ -310,6 +282,7 @@ class _ScalePass:
 
     Attributes:
         values: [terms] float64, value of each of `TERMS`; set after the first pass.
+        cached: Activations of the first pass by tile, as far as they are cached.
     """
 
     view: ScaledView
@@ -317,6 +290,7 @@ class _ScalePass:
     statistics: StatisticsTerms
     terms: list[PositionTerm]
     values: Tensor = field(init=False)
+    cached: dict[PartitionTile, Activations] = field(default_factory=dict)
 
 
 def make_loss(
@@ -350,40 +324,15 @@ def _styled_regions(style: Sequence[StyleTarget], view: ViewTarget) -> list[Styl
     """Return the regions of a view; without regions, the whole view is the only one."""
     if view.regions is None and len(style) == 1:
         return [replace(style[0], positions=view.coverage)]
-    if view.regions is None or len(view.regions) != len(style):
-        raise ValueError("the view was not prepared for the regions that the style has")
-    pairs = zip(style, view.regions, strict=True)
+    pairs = zip(style, view.regions or (), strict=True)
     return [replace(own, positions=weights) for own, weights in pairs if own.weight]
 
 
 class TargetBuilder:
-    """Builder of the targets of styles and views for one loss.
+    """Builder of the targets of styles and views for one loss."""
 
-    Args:
-        timer: Timer for `vgg_forward`, `statistics` and `communication`.
-        collectives: Collectives of the ranks that build each style target together.
-        style_scale: Magnification of style images relative to their default size.
-    """
-
-    def __init__(
-        self,
-        network: FeatureNetwork,
-        divider: Divider,
-        timer: Timer,
-        collectives: Collectives = ALONE,
-        *,
-        style_loss: StyleLossName = "sos",
-        has_content: bool = True,
-        style_scale: float = 1.0,
-    ) -> None:
-        self.style_scale = style_scale
-        self.network = network
-        self._divider = divider
-        self._timer = timer
-        self._collectives = collectives
-        self._has_content = has_content
-        self._compared = compared_layers(style_loss, network)
-        self._matched = nearest_layers(style_loss, network.name)
+    def __init__(self, loss: SosLoss) -> None:
+        self._loss = loss
 
     def of_style(self, style: Style, view_size: Size) -> StyleTargets:
         """Compute the targets of a style at all scales with a positive weight.
@@ -395,11 +344,11 @@ class TargetBuilder:
             ImageError: If the loss matches features, and the style image is too small to have any.
         """
         pyramids = [self._style_pyramid(image, view_size) for image in style.images]
-        layers = self._mixed_layers(pyramids, style.weights) if self._compared else {}
+        layers = self._mixed_layers(pyramids, style.weights) if self._loss.compared else {}
         vectors = {
             scale: self._style_vectors([pyramid[scale] for pyramid in pyramids], style.weights) for scale in pyramids[0]
         }
-        if self._matched and all(each is None for each in vectors.values()):
+        if self._loss.matched and all(each is None for each in vectors.values()):
             height, width = _size(pyramids[0][min(pyramids[0])])  # from the scales with a positive weight
             raise ImageError(
                 f"The style is used at {width} x {height} pixels, too few to match features with. "
@@ -409,9 +358,9 @@ class TargetBuilder:
 
     def _style_pyramid(self, image: Tensor, view_size: Size) -> dict[int, Tensor]:
         """Return a style image at the scales that are evaluated for views of a given size, on the network's device."""
-        size = style_size(_size(image), view_size, self.style_scale)
-        resized = resize_area(image, size).to(self.network.device)
-        return {scale: downscale(resized, scale) for scale in self._divider.tiling.scales(view_size)}
+        size = style_size(_size(image), view_size, self._loss.style_scale)
+        resized = resize_area(image, size).to(self._loss.network.device)
+        return {scale: downscale(resized, scale) for scale in self._loss.divider.tiling.scales(view_size)}
 
     def _mixed_layers(
         self, pyramids: Sequence[Mapping[int, Tensor]], weights: Sequence[float]
@@ -421,7 +370,7 @@ class TargetBuilder:
         mixed: dict[int, dict[str, LayerTarget]] = {}
         for scale in pyramids[0]:
             mixed[scale] = {}
-            for layer in self._compared:
+            for layer in self._loss.compared:
                 pairs = zip(every, weights, strict=True)
                 some = [(own[scale][layer], weight) for own, weight in pairs if layer in own[scale]]
                 if some:
@@ -433,15 +382,15 @@ class TargetBuilder:
 
         The work is divided among the ranks.
         """
-        division = self._divider.divide({scale: _size(image) for scale, image in scaled.items()})
+        division = self._loss.divider.divide({scale: _size(image) for scale, image in scaled.items()})
         targets: dict[int, dict[str, LayerTarget]] = {}
-        for scales in rounds(list(scaled), self._collectives.size):
+        for scales in rounds(list(scaled), self._loss.collectives.size):
             every = [each for scale in scales for each in self._own_statistics(scaled[scale], division.tiles[scale])]
-            with self._timer("communication"):
+            with self._loss.timer("communication"):
                 numbers = torch.zeros(0, dtype=torch.float64, device=every[0].mean.device)
-                parts = iter(self._collectives.all_reduce_statistics(every, numbers)[0])
+                parts = iter(self._loss.collectives.all_reduce_statistics(every, numbers)[0])
             for scale in scales:
-                statistics = {layer: next(parts) for layer in self._compared}
+                statistics = {layer: next(parts) for layer in self._loss.compared}
                 targets[scale] = {
                     layer: LayerTarget.of(own)
                     for layer, own in statistics.items()
@@ -455,10 +404,11 @@ class TargetBuilder:
         total: list[LayerStatistics] = []
         for tile in tiles:
             features = self._forward(image[tile.outer.slices]).features
-            with self._timer("statistics"):
-                own = [layer_statistics(features[c][tile.owned_cells(c, size)[1].slices]) for c in self._compared]
+            with self._loss.timer("statistics"):
+                own = [layer_statistics(features[c][tile.owned_cells(c, size)[1].slices]) for c in self._loss.compared]
                 total = [merge(*pair) for pair in zip(total, own, strict=True)] if total else own
-        return total or [LayerStatistics.zero(self.network.channels(layer), device) for layer in self._compared]
+        channels = map(self._loss.network.channels, self._loss.compared)
+        return total or [LayerStatistics.zero(count, device) for count in channels]
 
     def _style_vectors(self, images: Sequence[Tensor], weights: Sequence[float]) -> StyleVectors | None:
         """Compute the style vectors of weighted images [h, w, 3] at one scale.
@@ -469,9 +419,9 @@ class TargetBuilder:
         Returns:
             Style vectors; None if the loss matches no features, or the images are too small to have any.
         """
-        if not self._matched:
+        if not self._loss.matched:
             return None
-        stride = layer_stride(self._matched[0])
+        stride = layer_stride(self._loss.matched[0])
         counts = [(size[0] // stride) * (size[1] // stride) for size in map(_size, images)]
         chosen = positions_per_image(counts, weights, MAX_VECTORS)
         vectors = [
@@ -482,20 +432,20 @@ class TargetBuilder:
         if not vectors:
             return None
         return StyleVectors.of(
-            {layer: torch.cat([each[layer] for each in vectors]).to(images[0].device) for layer in self._matched}
+            {layer: torch.cat([each[layer] for each in vectors]).to(images[0].device) for layer in self._loss.matched}
         )
 
     def _vectors_of(self, image: Tensor, positions: Tensor) -> dict[str, Tensor]:
         """Return the features [k, c] of an image [h, w, 3] at some positions of the matched layers, on the CPU."""
         size = _size(image)
-        width = size[1] // layer_stride(self._matched[0])
+        width = size[1] // layer_stride(self._loss.matched[0])
         vectors = {
-            layer: torch.empty((len(positions), self.network.channels(layer)), dtype=self.network.dtype)
-            for layer in self._matched
+            layer: torch.empty((len(positions), self._loss.network.channels(layer)), dtype=self._loss.network.dtype)
+            for layer in self._loss.matched
         }
-        for tile in self._divider.tiles(size):
+        for tile in self._loss.tiling.tiles(size):
             features = self._forward(image[tile.outer.slices]).features
-            in_image, in_tile = tile.owned_cells(self._matched[0], size)
+            in_image, in_tile = tile.owned_cells(self._loss.matched[0], size)
             inside, row, column = positions_in(positions, width, in_image)
             for layer, values in vectors.items():
                 values[inside] = features[layer][in_tile.slices].cpu()[row, column]
@@ -510,10 +460,10 @@ class TargetBuilder:
         """
         height, width = _size(content)
         weights = None if coverage is None else self.position_weights(coverage)
-        scales = self._divider.tiling.scales((height, width))
-        division = self._divider.divide({scale: (height >> scale, width >> scale) for scale in scales}, weights)
-        target, device = ViewTarget(coverage=weights, division=division), self.network.device
-        if self._has_content:
+        scales = self._loss.divider.tiling.scales((height, width))
+        division = self._loss.divider.divide({scale: (height >> scale, width >> scale) for scale in scales}, weights)
+        target, device = ViewTarget(coverage=weights, division=division), self._loss.network.device
+        if self._loss.content_weight > 0:
             target.content = {
                 scale: self.content_features(ScaledView.of(downscale(content.to(device), scale), scale), tiles)
                 for scale, tiles in division.tiles.items()
@@ -522,10 +472,10 @@ class TargetBuilder:
 
     def position_weights(self, coverage: Tensor) -> list[Tensor]:
         """Downscale coverage [H, W] in 0..1 by every power of two that a layer needs at some scale."""
-        coarsest = self._divider.tiling.scales(_size(coverage))[-1]
+        coarsest = self._loss.divider.tiling.scales(_size(coverage))[-1]
         levels = coarsest + 1 + layer_stride("relu5_1").bit_length()
-        dtype = torch.promote_types(self.network.dtype, torch.float32)
-        finest = coverage.to(self.network.device, dtype)
+        dtype = torch.promote_types(self._loss.network.dtype, torch.float32)
+        finest = coverage.to(self._loss.network.device, dtype)
         return [downscale(finest, level) for level in range(levels)]
 
     def content_features(self, content: ScaledView, tiles: Sequence[PartitionTile]) -> ContentFeatures:
@@ -539,12 +489,12 @@ class TargetBuilder:
 
     def content_bytes(self, pieces: Sequence[Sequence[Piece]]) -> int:
         """Return the maximum size over all ranks of the `content_features` of a scale, in bytes."""
-        value = torch.finfo(self.network.dtype).bits // 8 * self.network.channels(CONTENT_LAYER)
+        value = torch.finfo(self._loss.network.dtype).bits // 8 * self._loss.network.channels(CONTENT_LAYER)
         return max(sum(piece.cells(CONTENT_LAYER) for piece in own) for own in pieces) * value
 
     def _forward(self, pixels: Tensor, until: str | None = None) -> Activations:
-        with self._timer("vgg_forward"):
-            return self.network.forward(pixels, cache=False, until=until)
+        with self._loss.timer("vgg_forward"):
+            return self._loss.network.forward(pixels, cache=False, until=until)
 
 
 def _size(image: Tensor) -> Size:

@@ -25,7 +25,6 @@ from sgsst_core.features.statistics import (
     LayerStatistics,
     block_of_channels,
     block_of_entries,
-    block_of_positions,
     blocks_of,
     can_be_fused,
     center,
@@ -34,7 +33,7 @@ from sgsst_core.features.statistics import (
     row_cells,
 )
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.parallel.division import Division, PositionWeights, ScaledView
+from sgsst_core.parallel import Division, PositionWeights, ScaledView
 from sgsst_core.settings import StyleLossName
 
 
@@ -158,29 +157,6 @@ class ViewTarget:
     regions: list[list[Tensor]] | None = None
     content_weights: list[Tensor] | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class TermInputs:
-    """Inputs of the terms of one scale of a view.
-
-    Attributes:
-        regions: Style targets with the positions of their regions; a single one if the scene has no regions.
-        content_weight: lambda_c; 0 for no content term.
-        content: Content features; None without a content term.
-        coverage: Position weights of terms that do not depend on the style.
-        content_weights: Position weights of the content term, relative to its weight; None for `coverage`.
-    """
-
-    view: ScaledView
-    network: FeatureNetwork
-    style_loss: StyleLossName
-    content_weight: float
-    regions: Sequence[StyleTarget]
-    content: ContentFeatures | None
-    coverage: PositionWeights
-    content_weights: PositionWeights
-    timer: Timer
 
 
 @dataclass(frozen=True)
@@ -429,11 +405,10 @@ class StatisticsTerms:
     the number of positions. There is no gradient before the statistics of the whole scale are compared.
     """
 
-    def __init__(self, inputs: TermInputs, layers: Sequence[str]) -> None:
-        self._view = inputs.view
-        self._network = inputs.network
-        self._regions = inputs.regions
-        self._layers = layers
+    def __init__(
+        self, view: ScaledView, network: FeatureNetwork, regions: Sequence[StyleTarget], layers: Sequence[str]
+    ) -> None:
+        self._view, self._network, self._regions, self._layers = view, network, regions, layers
         #: Gradients by layer, with the regions that they apply to.
         self._gradients: dict[str, list[tuple[StyleGradient, StyleTarget]]] = {}
 
@@ -551,7 +526,7 @@ def fused_add_style_gradient(
     from sgsst_core.loss import triton_kernels as kernels
 
     height, width, channels = features.shape
-    positions, tile, block = height * width, block_of_channels(channels, TILE), block_of_positions(POSITIONS)
+    positions, tile = height * width, block_of_channels(channels, TILE)
     weights = features if position_weights is None else position_weights
     if features.dtype in SPLIT_UNITS:
         matrix, low, offset = style.split or style.about_zero(features.dtype)
@@ -559,10 +534,10 @@ def fused_add_style_gradient(
     else:
         matrix, low, mean, offset = style.matrix, None, style.mean, style.offset
     with on_device(features.device):
-        kernels.add_style_gradient[(-(-positions // block) * -(-channels // tile),)](
+        kernels.add_style_gradient[(-(-positions // POSITIONS) * -(-channels // tile),)](
             features, weights, gradient, matrix, low, mean, offset,
             positions, width, row_cells(features), *weights.stride()[:2], row_cells(gradient),
-            CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEPS[features.element_size()]), P=block,
+            CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEPS[features.element_size()]), P=POSITIONS,
             WEIGHTED=position_weights is not None, RELU=relu, UNIT=SPLIT_UNITS.get(features.dtype, 1.0),
         )  # fmt: skip
 
@@ -584,44 +559,31 @@ def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:
     return weight / (torch.where(count > 0, count, torch.inf) * channels)
 
 
-@dataclass(frozen=True)
-class ContentDifference:
-    """Difference between content features and their target on some cells.
+def content_loss(features: Tensor, content: Tensor, position_weights: Tensor | None, factor: Tensor) -> Tensor:
+    """Return the contribution of some cells to the content loss, float64 scalar.
 
-    Attributes:
-        difference: [h, w, c], float32 or float64.
-        weighted: Difference times the position weights.
-        factor: lambda_c / (n c), float64, where n is the number of positions of the view or the sum of their weights.
+    Args:
+        features: [h, w, c], features of the image.
+        content: [h, w, c], features of the content image at the same positions.
+        position_weights: [h, w]; None for equal weights.
+        factor: Result of `content_factor`.
     """
+    difference, weighted = _content_difference(features, content, position_weights)
+    # A float32 dot product over a whole view would lose digits, so rows are summed first and then added in float64.
+    return factor * (weighted * difference).sum(dim=(1, 2)).sum(dtype=torch.float64)
 
-    difference: Tensor
-    weighted: Tensor
-    factor: Tensor
 
-    @staticmethod
-    def of(
-        features: Tensor, content: Tensor, factor: Tensor, position_weights: Tensor | None = None
-    ) -> ContentDifference:
-        """Compare features of the image with those of the content image at the same positions.
+def content_gradient(features: Tensor, content: Tensor, position_weights: Tensor | None, factor: Tensor) -> Tensor:
+    """Return the gradient of `content_loss` with respect to the features, [h, w, c]."""
+    return _content_difference(features, content, position_weights)[1] * (2 * factor)
 
-        Args:
-            features: [h, w, c].
-            content: [h, w, c].
-            position_weights: [h, w]; None for equal weights.
-        """
-        precision = torch.promote_types(features.dtype, torch.float32)
-        difference = features.to(precision) - content.to(precision)
-        weighted = difference if position_weights is None else difference * position_weights[:, :, None].to(precision)
-        return ContentDifference(difference, weighted, factor)
 
-    def loss(self) -> Tensor:
-        """Return the contribution of these cells to the content loss, float64 scalar."""
-        # A float32 dot product over a whole view would lose digits, so rows are summed first and then added in float64.
-        return self.factor * (self.weighted * self.difference).sum(dim=(1, 2)).sum(dtype=torch.float64)
-
-    def gradient(self) -> Tensor:
-        """Return the gradient with respect to the features, [h, w, c]."""
-        return self.weighted * (2 * self.factor)
+def _content_difference(features: Tensor, content: Tensor, position_weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the difference [h, w, c] from the content, float32 or float64, and the same times the position weights."""
+    precision = torch.promote_types(features.dtype, torch.float32)
+    difference = features.to(precision) - content.to(precision)
+    weighted = difference if position_weights is None else difference * position_weights[:, :, None].to(precision)
+    return difference, weighted
 
 
 @dataclass(frozen=True)
@@ -643,23 +605,23 @@ class ContentTerm:
     factor: Tensor
 
     @classmethod
-    def of(cls, inputs: TermInputs) -> Self | None:
-        """Return the term of one scale of a view; None if the loss does not have it."""
-        if inputs.content is None:
-            return None
-        count = inputs.view.count(CONTENT_LAYER, inputs.coverage)
-        network = inputs.network
-        weight = inputs.content_weight * network.feature_unit**2 * network.loss_factor
-        factor = content_factor(count, network.channels(CONTENT_LAYER), weight)
-        weights = inputs.coverage if inputs.content_weights is None else inputs.content_weights
-        return cls(inputs.view, inputs.content, weights, factor)
+    def of(cls, view: ScaledView, network: FeatureNetwork, weight: float, target: ViewTarget) -> Self:
+        """Return the term of one scale of a view.
+
+        Args:
+            weight: lambda_c.
+        """
+        weight = weight * network.feature_unit**2 * network.loss_factor
+        factor = content_factor(view.count(CONTENT_LAYER, target.coverage), network.channels(CONTENT_LAYER), weight)
+        weights = target.coverage if target.content_weights is None else target.content_weights
+        return cls(view, target.content[view.scale], weights, factor)
 
     def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
         """Return the contribution of the cells that a tile owns, float64 scalar, given features by layer."""
         owned = self._owned(tile, features[CONTENT_LAYER])
         if _can_be_fused(*owned[:2]):
             return self.factor * fused_content_sum(*owned)
-        return self._difference(*owned).loss()
+        return content_loss(*owned, self.factor)
 
     def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> bool | None:
         """Add the derivative of `value` with respect to a layer's features to a gradient in place.
@@ -681,7 +643,7 @@ class ContentTerm:
             relu = added.shape == gradient.shape
             fused_add_content_gradient(added, *owned, self.factor, relu=relu)
             return relu
-        added += self._difference(*owned).gradient()
+        added += content_gradient(*owned, self.factor)
         return False
 
     def _owned(self, tile: PartitionTile, features: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -690,12 +652,9 @@ class ContentTerm:
         weights = self.view.weights(CONTENT_LAYER, in_view, self.position_weights)
         return features[in_tile.slices], self.content[tile], weights
 
-    def _difference(self, features: Tensor, content: Tensor, weights: Tensor | None) -> ContentDifference:
-        return ContentDifference.of(features, content, self.factor, weights)
-
 
 def fused_content_sum(features: Tensor, content: Tensor, position_weights: Tensor | None = None) -> Tensor:
-    """Return the sum of a_p |F_p - content_p|^2 as `ContentDifference.loss` computes it, float64 scalar."""
+    """Return the sum of a_p |F_p - content_p|^2 as `content_loss` computes it, float64 scalar."""
     from sgsst_core.loss import triton_kernels as kernels
 
     launch, constants = _launch(features, content, position_weights)
@@ -717,7 +676,7 @@ def fused_add_content_gradient(
     *,
     relu: bool = False,
 ) -> None:
-    """Add `ContentDifference.gradient` to a gradient [h, w, c], and pass it through the features' ReLU if `relu`."""
+    """Add `content_gradient` to a gradient [h, w, c], and pass it through the features' ReLU if `relu`."""
     from sgsst_core.loss import triton_kernels as kernels
 
     launch, constants = _launch(features, content, position_weights)
@@ -736,10 +695,9 @@ def _launch(
     height, width, channels = features.shape
     steps = (0, 0) if position_weights is None else position_weights.stride()[:2]
     numbers = (height * width, width, row_cells(features), row_cells(content), *steps)
-    block = block_of_channels(channels)
     return numbers, {
         "CHANNELS": channels,
-        "BLOCK": block,
+        "BLOCK": block_of_channels(channels),
         "P": CONTENT_POSITIONS,
         "WEIGHTED": position_weights is not None,
     }
@@ -949,18 +907,23 @@ class NearestTerm:
     matches: dict[PartitionTile, list[Matches]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, inputs: TermInputs) -> Self | None:
-        """Return the term of one scale of a view; None if the loss does not have it."""
-        network = inputs.network
-        layers = nearest_layers(inputs.style_loss, network.name)
-        regions = []
-        for style in inputs.regions if layers else ():
+    def of(
+        cls,
+        view: ScaledView,
+        network: FeatureNetwork,
+        style_loss: StyleLossName,
+        styles: Sequence[StyleTarget],
+        timer: Timer,
+    ) -> Self:
+        """Return the term of one scale of a view, given the style targets of its regions."""
+        layer, regions = nearest_layers(style_loss, network.name)[0], []
+        for style in styles:
             if style.vectors is not None:
-                count = inputs.view.count(layers[0], style.positions)
-                weight = style.weight * nearest_weight(inputs.style_loss, network.unit) * network.loss_factor
+                count = view.count(layer, style.positions)
+                weight = style.weight * nearest_weight(style_loss, network.unit) * network.loss_factor
                 factor = weight / torch.where(count > 0, count, torch.inf)
                 regions.append((style.vectors, factor, style.positions))
-        return cls(inputs.view, layers[0], network.rounding, inputs.timer, regions) if regions else None
+        return cls(view, layer, network.rounding, timer, regions)
 
     def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
         """Return the contribution of the cells that a tile owns, float64 scalar."""
@@ -995,7 +958,6 @@ class NearestTerm:
 #: Names of the terms whose sum is the loss of a scale, in the order of summation.
 TERMS = (*STATISTICS_TERMS, ContentTerm.name, NearestTerm.name)
 #: Terms that are sums over the positions of a view. Every tile adds the positions that it owns.
-POSITION_TERMS = (ContentTerm, NearestTerm)
 PositionTerm = ContentTerm | NearestTerm
 
 

@@ -16,18 +16,17 @@ from sgsst_core.features.partition import computed_twice, scaled_region
 from sgsst_core.features.vgg import (
     FeatureNetwork,
     has_bfloat16,
-    has_float16,
     has_matrix_units,
     has_tf32,
     use_whole_float32,
 )
 from sgsst_core.loss.graphs import can_use_graphs
 from sgsst_core.loss.terms import layers_of
-from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.parallel.division import Size, Tiling
+from sgsst_core.parallel import Collectives, Size, Tiling
 from sgsst_core.planning.survey import Survey
-from sgsst_core.rasterizer import Rasterizer, drawing_problem, gpu_rasterizers, make_rasterizer, rasterizer_for
+from sgsst_core.rasterizer import Rasterizer, drawing_problem, make_rasterizer, rasterizer_for
 from sgsst_core.rasterizer.base import Precision as WeightPrecision
+from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scales import ScaleWeights, scale_count
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
@@ -216,7 +215,7 @@ def describe_machine(settings: Settings, collectives: Collectives) -> Machine:
     # The partition, and thereby rounding, depends on the limit, so it must be identical on all ranks.
     limit = settings.memory_limit or default_memory_limit(torch.device(device))
     has: dict[PlannedPrecision, bool] = {
-        "float16": has_float16(device),
+        "float16": has_tf32(device),
         "bfloat16": has_matrix_units() if device == "cpu" else has_bfloat16(device),
         "tf32": has_tf32(device),
         "winograd": device == "cpu",
@@ -263,17 +262,9 @@ def common_device(collectives: Collectives) -> Device:
 
 
 def gpu_problems(collectives: Collectives) -> dict[str, str]:
-    """Return the problem of each GPU rasterizer that does not work on some rank, by the rasterizer's name.
-
-    Rasterizers are tried in order of preference, until one works.
-    """
-    problems: dict[str, str] = {}
-    for name in gpu_rasterizers():
-        problem = rasterizer_problem(collectives, name)
-        if problem is None:
-            break
-        problems[name] = problem
-    return problems
+    """Return the problem of the GPU rasterizer by its name, if it does not work on some rank."""
+    problem = rasterizer_problem(collectives, TritonRasterizer.name)
+    return {} if problem is None else {TritonRasterizer.name: problem}
 
 
 def rasterizer_problem(collectives: Collectives, name: str) -> str | None:

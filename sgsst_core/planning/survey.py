@@ -18,7 +18,7 @@ from torch import Tensor
 from sgsst_core.errors import CameraError
 from sgsst_core.features.partition import Rectangle, covered_region
 from sgsst_core.files.images import Photo, load_photo
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.progress import Decision, Progress
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread

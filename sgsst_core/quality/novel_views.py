@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import Cache, tensor_bytes
+from sgsst_core.budget import Cache
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import StyleTargets
 from sgsst_core.planning.survey import sees_something
@@ -138,7 +138,7 @@ class NovelViews:
         Raises:
             ValueError: If an image contains NaN or infinity.
         """
-        images: Cache[int, Tensor] = Cache(self._image_memory, tensor_bytes)
+        images: Cache[int, Tensor] = Cache(self._image_memory)
         sh_dc = sh_dc.detach().to(self.rasterizer.device)
 
         def rendered(index: int) -> Tensor:

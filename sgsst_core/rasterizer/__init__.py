@@ -14,16 +14,15 @@ from sgsst_core.constants import NEAR, RASTER_TILE
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.base import Color, Rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-__all__ = ["RASTERIZERS", "Rasterizer", "drawing_problem", "gpu_rasterizers", "make_rasterizer", "rasterizer_for"]
+__all__ = ["RASTERIZERS", "Rasterizer", "drawing_problem", "make_rasterizer", "rasterizer_for"]
 
-#: All rasterizers by name; those for GPUs in order of preference.
+#: All rasterizers by name.
 RASTERIZERS: dict[str, type[Rasterizer]] = {
-    kind.name: kind for kind in (TritonRasterizer, CpuRasterizer, CachedRasterizer, ReferenceRasterizer)
+    kind.name: kind for kind in (TritonRasterizer, CpuRasterizer, CachedRasterizer)
 }
 
 
@@ -41,7 +40,7 @@ def make_rasterizer(
 
     Args:
         name: `cpu` computes blend weights in every call; `cached` stores them (its options are `precision`, `max_bytes`
-            and `uncached`); `triton` runs on GPUs; `reference` is slow and float64.
+            and `uncached`); `triton` runs on GPUs.
         scene, background: As in `Rasterizer`.
         device: Device for `cached` and `triton`. None selects the CPU for `cached` (or the device of its option
             `uncached`), and the current GPU for `triton`.
@@ -66,20 +65,15 @@ def make_rasterizer(
     return kind(scene, background=background, near=near, device=device, **options)
 
 
-def gpu_rasterizers() -> list[str]:
-    """Return the names of the rasterizers for GPUs in order of preference."""
-    return [name for name, kind in RASTERIZERS.items() if kind.on_gpu]
-
-
 def rasterizer_for(device: str, unusable: Collection[str]) -> str:
-    """Return the name of the rasterizer that computes blend weights: on a GPU, the first one that works.
+    """Return the name of the rasterizer that computes blend weights: on a GPU `triton`, if it works.
 
     Args:
         device: Type of the job's device, "cpu" or "cuda".
         unusable: Names of GPU rasterizers that do not work.
     """
-    working = [name for name in gpu_rasterizers() if name not in unusable]
-    return working[0] if working and torch.device(device).type != "cpu" else CpuRasterizer.name
+    on_gpu = torch.device(device).type != "cpu" and TritonRasterizer.name not in unusable
+    return TritonRasterizer.name if on_gpu else CpuRasterizer.name
 
 
 def drawing_problem(name: str, device: torch.device | str = "cuda") -> str | None:

@@ -7,7 +7,7 @@ the blend weights and T_final is the final transmittance. The gradient with resp
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -41,7 +41,7 @@ def camera_key(camera: Camera) -> CameraKey:
 class Rasterizer(ABC):
     """Renderer of a scene with frozen geometry and arbitrary colors.
 
-    A new rasterizer implements `_render`, `_coverage` and `_color_gradient` and is listed in
+    A new rasterizer implements `_render`, `coverage` and `_color_gradient` and is listed in
     `sgsst_core.rasterizer.RASTERIZERS`; everything else has a default. Public methods accept colors and image gradients
     of any floating dtype on any device. Results are on `device`, in `dtype`. A wrong shape raises ValueError.
 
@@ -102,9 +102,9 @@ class Rasterizer(ABC):
             raise ValueError(f"colors of shape {tuple(colors.shape)}: the scene needs {expected}")
         return self._render(self._converted(colors), camera)
 
+    @abstractmethod
     def coverage(self, camera: Camera) -> Tensor:
         """Return 1 - T_final, [h, w] in [0, 1]: how much of each pixel the Gaussians cover."""
-        return self._coverage(camera)
 
     def color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
         """Return W^T dL/dimage, [N, 3], given the image gradient [h, w, 3]."""
@@ -125,10 +125,6 @@ class Rasterizer(ABC):
     @abstractmethod
     def _render(self, colors: Tensor, camera: Camera) -> Tensor:
         """Implement `render` for valid arguments on the rasterizer's device, in its dtype."""
-
-    @abstractmethod
-    def _coverage(self, camera: Camera) -> Tensor:
-        """Implement `coverage`."""
 
     @abstractmethod
     def _color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
@@ -152,12 +148,7 @@ class Rasterizer(ABC):
 
     @property
     def uncached(self) -> Rasterizer:
-        """Rasterizer that computes blend weights in every call."""
-        return self
-
-    @property
-    def repeatable(self) -> Rasterizer:
-        """Rasterizer whose images are bit-identical whether or not weights are cached."""
+        """Rasterizer that computes blend weights in every call, so that images do not depend on what is cached."""
         return self
 
     def count_weights(self, camera: Camera) -> CountedPieces:
@@ -187,19 +178,11 @@ class Rasterizer(ABC):
         """Drop all cached data of views, because other views or other rectangles of them are rendered from now on."""
 
 
-class Sized(Protocol):
-    """Object with a known memory use."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory use in bytes."""
-
-
-L = TypeVar("L", bound=Sized)
+L = TypeVar("L")
 
 
 class TiledRasterizer(Rasterizer, Generic[L]):
-    """Rasterizer whose tile intersections are cached within a budget, besides those of the latest view.
+    """Rasterizer whose tile intersections, of type L, are cached within a budget, besides those of the latest view.
 
     Args:
         scene, background, near, device: As in `Rasterizer`.
@@ -211,7 +194,7 @@ class TiledRasterizer(Rasterizer, Generic[L]):
     def __init__(self, scene: Scene, *, max_intersection_bytes: int | None = None, **common: Any) -> None:
         super().__init__(scene, max_intersection_bytes=max_intersection_bytes, **common)
         budget = self.default_intersection_bytes if max_intersection_bytes is None else max_intersection_bytes
-        self._intersections: Cache[CameraKey, L] = Cache(budget, lambda isects: isects.nbytes, holds_latest=True)
+        self._intersections: Cache[CameraKey, L] = Cache(budget, holds_latest=True)
 
     @classmethod
     def options(cls, memory: int) -> dict[str, Any]:

@@ -82,10 +82,6 @@ def _load(builder: Any, pointer: Any, vector_type: Any = _VECTOR, align: int = 4
     return builder.load(builder.bitcast(pointer, vector_type.as_pointer()), align=align)
 
 
-def _is_weights(array: Any) -> bool:
-    return isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.float32
-
-
 @intrinsic
 def blend_row(typingctx, block, row, u, u_scale, log2_alpha, alpha_max):
     """Blend one Gaussian into a row of 16 pixels. block [2, 16, 16] holds transmittances and receives weights.
@@ -154,8 +150,6 @@ def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, b
 
     `weights` is flat, float32; `pixels` is [P, 3, 8] float32. Bounds are not checked.
     """
-    if not _is_weights(weights):
-        return None
     scalars = (types.float32,) * _CHANNELS
     signature = types.void(weights, types.int64, types.int64, pixels, types.int64, *scalars)
 
@@ -184,8 +178,6 @@ def dot_pixels(typingctx, weights, begin, vectors, pixels, offset):
     Each lane is summed in order, then the lanes are added pairwise, so the result is deterministic. Arrays are as in
     `add_scaled`.
     """
-    if not _is_weights(weights):
-        return None
     signature = types.UniTuple(types.float32, _CHANNELS)(weights, types.int64, types.int64, pixels, types.int64)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -215,8 +207,6 @@ def sum_weights(typingctx, weights, begin, vectors):
 
     Bit-identical to `dot_pixels` with pixels of 1. `weights` is flat, float32. Bounds are not checked.
     """
-    if not _is_weights(weights):
-        return None
     signature = types.float32(weights, types.int64, types.int64)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -235,8 +225,6 @@ def sum_weights(typingctx, weights, begin, vectors):
 @intrinsic
 def prefetch(typingctx, values, index):
     """Prefetch the cache line of an element of the flat array `values`. This is only a hint and cannot fail."""
-    if not isinstance(values, types.Array) or values.layout != "C":
-        return None
     signature = types.void(values, types.int64)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:

@@ -19,7 +19,6 @@ reduced to reading W from memory. Weights are stored on the device that applies 
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -32,9 +31,12 @@ from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, LOG2_ALPHA_MIN, TO_POWER_
 from sgsst_core.devices import on_device
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.base import CameraKey, Precision, Rasterizer, TiledRasterizer, camera_key
-from sgsst_core.rasterizer.projection import check_intersections, tile_grid
+from sgsst_core.rasterizer.cpu import check_intersections, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+
+#: Compile-time constants of the compositing kernels.
+_CUTS = {"ALPHA_MAX": ALPHA_MAX, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN}
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class DeviceIntersections:
 
     Attributes:
         gaussians: [V] int64, indices into the scene, front to back.
-        values: [V, 8] float64, see `projection.Column`.
+        values: [V, 8] float64, see `cpu.Column`.
         starts: [tiles + 1] int64, first entry of each tile.
         ranks: [E] int32, rank (index into `gaussians`) of each entry, front to back within a tile.
         slots: [E] int32, slot of each entry; the slots of one Gaussian are contiguous.
@@ -125,7 +127,8 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
     def _render(self, colors: Tensor, camera: Camera) -> Tensor:
         return self._blend(colors, camera)[0]
 
-    def _coverage(self, camera: Camera) -> Tensor:
+    def coverage(self, camera: Camera) -> Tensor:
+        """Return 1 - T_final, [h, w]."""
         return 1 - self._blend(torch.zeros((len(self.scene), 3), device=self.device), camera)[1]
 
     def _color_gradient(self, image_gradient: Tensor, camera: Camera) -> Tensor:
@@ -137,12 +140,12 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
         if not visible:
             return gradient
         slots = torch.zeros((len(isects.ranks), 3), device=self.device)
-        across, tiles = tiles_of(camera)
+        across, down = tile_grid(camera)
         with on_device(self.device):
-            kernels.slot_gradients[(tiles,)](
+            kernels.slot_gradients[(across * down,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, image_gradient, slots,
                 camera.width, camera.height, across,
-                **self.cuts(kernels.SUMMING_WARPS),
+                **_CUTS, num_warps=kernels.SUMMING_WARPS,
             )  # fmt: skip
         add_slots_(gradient, slots, isects.first_slots, isects.gaussians)
         return gradient
@@ -154,18 +157,14 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
         isects = self.intersections(camera)
         image = torch.empty((camera.height, camera.width, 3), device=self.device)
         transmittance = torch.empty((camera.height, camera.width), device=self.device)
-        across, tiles = tiles_of(camera)
+        across, down = tile_grid(camera)
         with on_device(self.device):
-            kernels.render[(tiles,)](
+            kernels.render[(across * down,)](
                 isects.ranks, isects.starts, isects.gaussians, isects.values, colors, self.background,
                 image, transmittance, camera.width, camera.height, across,
-                **self.cuts(kernels.PIXEL_WARPS),
+                **_CUTS, num_warps=kernels.PIXEL_WARPS,
             )  # fmt: skip
         return image, transmittance
-
-    def cuts(self, warps: int) -> dict[str, float | int]:
-        """Return the compile-time constants of a compositing kernel with this number of warps per program."""
-        return {"ALPHA_MAX": ALPHA_MAX, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN, "num_warps": warps}
 
     def _build(self, camera: Camera) -> DeviceIntersections:
         """Project and sort the Gaussians and compute tile intersections; synchronizes with the device once."""
@@ -192,8 +191,7 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
                     SUPPORT=-LOG2_ALPHA_MIN, POWER=TO_POWER_OF_TWO, BLOCK=block,
                 )  # fmt: skip
         ordered, order = torch.sort(depths, stable=True)
-        first_slots = torch.zeros(count + 1, dtype=torch.int64, device=self.device)
-        torch.cumsum(counts[order], 0, out=first_slots[1:])
+        first_slots = _offsets(counts[order], torch.int64)
         visible, total = torch.stack([ordered.isfinite().sum(), first_slots[-1]]).tolist()
         check_intersections(total, visible, camera)
         order, first_slots = order[:visible].clone(), first_slots[: visible + 1].clone()
@@ -229,12 +227,6 @@ def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: 
         )
 
 
-def tiles_of(camera: Camera) -> tuple[int, int]:
-    """Return the number of raster tiles per tile row, and in the whole view."""
-    across, down = tile_grid(camera)
-    return across, across * down
-
-
 _DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "half": torch.float16}
 
 
@@ -245,6 +237,7 @@ class CountedPieces:
 
     Attributes:
         pieces: P, number of pieces.
+        index_type: Integer dtype for piece and slot indices.
         slot_pieces: [E] int32, number of pieces of each pair of Gaussian and raster tile.
         block_pieces: [16 tiles] int32, pieces of every block.
         masks: [E] int32, bit mask of the blocks of its tile in which each pair has weights.
@@ -253,12 +246,12 @@ class CountedPieces:
 
     def __init__(self, rasterizer: TritonRasterizer, camera: Camera) -> None:
         from sgsst_core.rasterizer import triton_kernels as kernels
-        from sgsst_core.rasterizer.triton_kernels import SUMMING_WARPS
 
         self.rasterizer, self.camera = rasterizer, camera
         self.intersections = isects = rasterizer.intersections(camera)
         device = rasterizer.device
-        self.across, self.tiles = tiles_of(camera)
+        across, down = tile_grid(camera)
+        self.view, self.tiles = (camera.width, camera.height, across), across * down
         self.masks = torch.zeros(len(isects.ranks), dtype=torch.int32, device=device)
         self.slot_pieces = torch.zeros_like(self.masks)
         self.block_pieces = torch.empty(self.tiles * kernels.BLOCKS.value, dtype=torch.int32, device=device)
@@ -266,15 +259,11 @@ class CountedPieces:
         with on_device(device):
             kernels.count_pieces[(self.tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, self.masks, self.slot_pieces,
-                self.block_pieces, self.ends, camera.width, camera.height, self.across,
-                **rasterizer.cuts(SUMMING_WARPS),
+                self.block_pieces, self.ends, *self.view,
+                **_CUTS, num_warps=kernels.SUMMING_WARPS,
             )  # fmt: skip
         self.pieces = int(self.block_pieces.sum())
-
-    @property
-    def index_type(self) -> torch.dtype:
-        """Integer dtype for piece and slot indices."""
-        return torch.int32 if self.pieces < 2**31 else torch.int64
+        self.index_type = torch.int32 if self.pieces < 2**31 else torch.int64
 
     def nbytes(self, precision: Precision) -> int:
         """Return the size of the weights in bytes."""
@@ -285,10 +274,6 @@ class CountedPieces:
         piece = 4 + index + kernels.PIECE.value * _DTYPES[precision].itemsize
         starts = len(self.block_pieces) + 1 + visible + 1
         return int(self.pieces * piece + starts * index + 4 * (visible + pixels))
-
-    def store(self, precision: Precision) -> WeightPieces:
-        """Compute the weights again and store them."""
-        return WeightPieces(self, precision)
 
 
 class WeightPieces:
@@ -306,9 +291,10 @@ class WeightPieces:
 
     def __init__(self, counted: CountedPieces, precision: Precision) -> None:
         from sgsst_core.rasterizer import triton_kernels as kernels
-        from sgsst_core.rasterizer.triton_kernels import PIXEL_WARPS
 
         rasterizer, isects, index_type = counted.rasterizer, counted.intersections, counted.index_type
+        #: Launch grid, one program per block; and kernel arguments: width, height, and raster tiles per row.
+        self._grid, self._view = (len(counted.block_pieces),), counted.view
         self._rasterizer, self.camera = rasterizer, counted.camera
         self.scale = kernels.HALF_SCALE if precision == "half" else 1.0
         slot_starts = _offsets(counted.slot_pieces, index_type)
@@ -327,18 +313,14 @@ class WeightPieces:
             kernels.store_pieces[(counted.tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, isects.gaussians, counted.masks, counted.ends,
                 slot_starts, self.block_starts, self.piece_gaussians, self.piece_slots, self.weights,
-                self.transmittance, *self._view_arguments(),
-                **rasterizer.cuts(PIXEL_WARPS), SCALE=self.scale,
+                self.transmittance, *self._view,
+                **_CUTS, num_warps=kernels.PIXEL_WARPS, SCALE=self.scale,
             )  # fmt: skip
 
     @property
     def nbytes(self) -> int:
         """Size of the weights on the device in bytes."""
-        tensors = (
-            *(self.block_starts, self.piece_gaussians, self.piece_slots, self.weights),
-            *(self.first_slots, self.gaussians, self.transmittance),
-        )
-        return sum(tensor.nbytes for tensor in tensors)
+        return sum(value.nbytes for value in vars(self).values() if isinstance(value, Tensor))
 
     def render(self, colors: Tensor) -> Tensor:
         """Return the image [h, w, 3] of colors [N, 3] over the background."""
@@ -346,9 +328,9 @@ class WeightPieces:
 
         image = torch.empty((*self.transmittance.shape, 3), device=colors.device)
         with on_device(colors.device):
-            kernels.apply_pieces[self._grid()](
+            kernels.apply_pieces[self._grid](
                 self.block_starts, self.piece_gaussians, self.weights, colors, self._rasterizer.background,
-                self.transmittance, image, *self._view_arguments(),
+                self.transmittance, image, *self._view,
                 SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
             )  # fmt: skip
         return image
@@ -362,20 +344,12 @@ class WeightPieces:
             return gradient
         slots = torch.empty((len(self.piece_slots), 3), device=image_gradient.device)
         with on_device(image_gradient.device):
-            kernels.piece_gradients[self._grid()](
-                self.block_starts, self.piece_slots, self.weights, image_gradient, slots, *self._view_arguments(),
+            kernels.piece_gradients[self._grid](
+                self.block_starts, self.piece_slots, self.weights, image_gradient, slots, *self._view,
                 SCALE=self.scale, P=kernels.PIECES.value, num_warps=1,
             )  # fmt: skip
         add_slots_(gradient, slots, self.first_slots, self.gaussians)
         return gradient
-
-    def _grid(self) -> tuple[int]:
-        """Return the launch grid: one program per block."""
-        return (len(self.block_starts) - 1,)
-
-    def _view_arguments(self) -> tuple[int, int, int]:
-        """Return the kernel arguments that describe the view: width, height, and raster tiles per row."""
-        return self.camera.width, self.camera.height, tiles_of(self.camera)[0]
 
 
 def _offsets(counts: Tensor, dtype: torch.dtype) -> Tensor:
@@ -437,7 +411,6 @@ class CachedRasterizer(Rasterizer):
         self.min_intersection_bytes = min_intersection_bytes
         self._at_first_use = at_first_use
         self._cached: Cache[CameraKey, WeightPieces] = Cache(max_bytes)
-        self._lock = threading.Lock()
 
     @classmethod
     def options(cls, memory: int) -> dict[str, Any]:
@@ -445,23 +418,9 @@ class CachedRasterizer(Rasterizer):
         return {"max_bytes": memory}
 
     @property
-    def cached_bytes(self) -> int:
-        """Size of all cached weights in bytes."""
-        return self._cached.used
-
-    @property
     def uncached(self) -> Rasterizer:
         """Rasterizer that computes blend weights in every call."""
         return self._uncached
-
-    @property
-    def repeatable(self) -> Rasterizer:
-        """Rasterizer whose images are bit-identical whether or not weights are cached."""
-        return self.uncached
-
-    def count_weights(self, camera: Camera) -> CountedPieces:
-        """Count a view's weights without storing them; takes about as long as one render."""
-        return self.uncached.count_weights(camera)
 
     def cache_weights(self, camera: Camera) -> bool:
         """Cache a view's weights if they fit, and return whether the view has cached weights.
@@ -469,19 +428,13 @@ class CachedRasterizer(Rasterizer):
         The first call for a view decides whether its weights fit; later calls do not reconsider this.
         """
         key = camera_key(camera)
-        with self._lock:
-            if key not in self._cached:
-                self._cached.add(key, lambda: self._counted(camera))
-            return key in self._cached
+        self._cached.add(key, lambda: self._counted(camera))
+        return key in self._cached
 
     @property
     def caches(self) -> dict[str, Cache[CameraKey, Any]]:
         """Caches of blend weights, "weights", and those of the uncached rasterizer."""
         return {"weights": self._cached, **self.uncached.caches}
-
-    def intersection_budget(self, weights: int) -> int | None:
-        """Return the budget for tile intersections beside `weights` bytes of cached weights; None for no limit."""
-        return None if self.max_bytes is None else max(self.max_bytes - weights, self.min_intersection_bytes)
 
     def forget_views(self) -> None:
         """Drop the weights and the tile intersections of all views."""
@@ -499,7 +452,8 @@ class CachedRasterizer(Rasterizer):
         cached = self._cached_for(camera)
         return self.uncached.render(colors, camera) if cached is None else cached.render(colors)
 
-    def _coverage(self, camera: Camera) -> Tensor:
+    def coverage(self, camera: Camera) -> Tensor:
+        """Return 1 - T_final, [h, w]."""
         cached = self._cached_for(camera)
         return self.uncached.coverage(camera) if cached is None else 1 - cached.transmittance
 
@@ -517,13 +471,13 @@ class CachedRasterizer(Rasterizer):
 
     def _counted(self, camera: Camera) -> tuple[int, Callable[[], WeightPieces]]:
         """Return the size in bytes of a view's weights, and a function that computes them."""
-        counted = self.count_weights(camera)
+        counted = self.uncached.count_weights(camera)
 
         def make() -> WeightPieces:
-            weights = counted.store(self.precision)
-            budget = self.intersection_budget(self.cached_bytes + weights.nbytes)
-            if budget is not None:
-                self.uncached.release_view(camera, budget)
+            weights = WeightPieces(counted, self.precision)
+            if self.max_bytes is not None:
+                left = self.max_bytes - self._cached.used - weights.nbytes
+                self.uncached.release_view(camera, max(left, self.min_intersection_bytes))
             return weights
 
         return counted.nbytes(self.precision), make

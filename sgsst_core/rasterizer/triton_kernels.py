@@ -65,7 +65,7 @@ def _tile_rows(value_y, extent_y, height):
 def _tile_span(x, y, skew, u_scale, w_scale, support, extent_x, extent_y, first, last, width):
     """Return the range (begin, end) of tile columns that a Gaussian's support reaches in pixel rows first..last.
 
-    See `tile_intersections._tile_span`.
+    See `cpu._tile_span`.
     """
     top, bottom = first.to(tl.float64) + 0.5 - y, last.to(tl.float64) + 0.5 - y
     safe = tl.where(extent_x > 0, extent_x, 1.0)
@@ -100,12 +100,12 @@ def project(
     EPS2D: tl.constexpr, ANTIALIASED: tl.constexpr, SUPPORT: tl.constexpr, POWER: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Run `projection.project` for BLOCK Gaussians per program, and count the raster tiles that each intersects.
+    """Run `cpu.project` for BLOCK Gaussians per program, and count the raster tiles that each intersects.
 
     Args:
         camera: [23] float64: the upper three rows of world_to_camera, fx, fy, cx, cy, width, height, near, and
             `Camera.slope_limits`.
-        values: Output [N, 8] float64, see `projection.Column`; rows of invisible Gaussians are not written.
+        values: Output [N, 8] float64, see `cpu.Column`; rows of invisible Gaussians are not written.
         depths: Output [N] float64, infinite for invisible Gaussians.
         counts: Output [N] int32, 0 for invisible Gaussians.
     """

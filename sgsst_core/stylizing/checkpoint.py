@@ -20,8 +20,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 from sgsst_core.errors import CheckpointError
+from sgsst_core.features.vgg import EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE, EVEN_SCALE
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.loss.feature_scale import EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE, EVEN_SCALE
 from sgsst_core.messages import from_json, to_json
 from sgsst_core.planning.plan import Plan
 from sgsst_core.regions import Regions

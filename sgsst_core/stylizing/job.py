@@ -17,14 +17,12 @@ from sgsst_core.budget import Cache, forget_device_peak, memory_for
 from sgsst_core.devices import Timer
 from sgsst_core.errors import DeviceMemoryError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.feature_scale import weights_for
+from sgsst_core.features.vgg import FeatureNetwork, weights_for
 from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
 from sgsst_core.loss.terms import StyleTargets, ViewTarget, combined
 from sgsst_core.orbit import Orbit
-from sgsst_core.parallel.collectives import ALONE, Collectives, Team
-from sgsst_core.parallel.division import Size
+from sgsst_core.parallel import ALONE, Collectives, Size, Team
 from sgsst_core.planning.facts import PlanningContext, make_network, sharing_memory
 from sgsst_core.planning.plan import Plan, ends_with_transfer
 from sgsst_core.planning.time_budget import TimeChoice
@@ -57,7 +55,7 @@ class JobInputs:
         photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
             for unstylized renders.
         regions: Regions of the scene, each with its own style or frozen; None for one style everywhere.
-        rasterizer: Rasterizer that computes blend weights: "cpu", "triton" or "reference". None to choose one.
+        rasterizer: Rasterizer that computes blend weights: "cpu" or "triton". None to choose one.
         measured: Whether quality is measured and a report is written, as in `sgsst stylize`.
         orbit: Orbit that produced the cameras, for the plan to report; None for cameras from files.
         about_inputs: Decisions about cameras and photos that start the plan.
@@ -466,7 +464,6 @@ def prepare_job(
     )
     if plan.spare:
         views.caches["intersections"].limit(memory_for("rasterizer", memory) + plan.spare // 2)
-    repeatable = rasterizer.repeatable
     view_targets = ViewTargets(
         views,
         loss,
@@ -476,8 +473,8 @@ def prepare_job(
         regions=plan.survey.regions if plan.weighted else None,
         background=settings.background,
         drawn=plan.training_background != "background",
-        maps=styles.maps(repeatable, plan.seen),
-        content_maps=styles.content_maps(repeatable, plan.seen),
+        maps=styles.maps(rasterizer.uncached, plan.seen),
+        content_maps=styles.content_maps(rasterizer.uncached, plan.seen),
     )
     return StylizationJob(
         plan=plan,
@@ -501,7 +498,7 @@ def prepare_job(
 def in_bfloat16(job: StylizationJob, step: int) -> StylizationJob:
     """Return a job whose network continues in bfloat16 from a step in which float16 has overflowed."""
     network = make_network(job.weights, job.settings, "bfloat16", job.plan.device)
-    job.loss.use(network)
+    job.loss.network = network
     job.view_targets.forget_division()
     if job.graphs is not None:
         job.graphs.clear()

@@ -22,14 +22,13 @@ import torch
 from sgsst_core.budget import memory_for
 from sgsst_core.devices import Timer, wait_for
 from sgsst_core.errors import CameraError, OutputError
-from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.features.vgg import FeatureNetwork, weights_for
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.atomic import write_json
-from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import has_statistics
 from sgsst_core.orbit import orbit_decisions
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.facts import (
     Facts,
     PlanningContext,

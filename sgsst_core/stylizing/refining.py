@@ -19,10 +19,10 @@ from torch import Tensor
 
 from sgsst_core.budget import memory_for
 from sgsst_core.constants import SH_C0
-from sgsst_core.loss.feature_scale import weights_for
+from sgsst_core.features.vgg import weights_for
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import StyleTargets, ViewTarget
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.facts import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, psnr, sees_something
 from sgsst_core.progress import Progress

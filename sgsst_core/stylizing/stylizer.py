@@ -26,7 +26,7 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.rasterizer import make_rasterizer

@@ -11,14 +11,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import Cache, content_fraction, tensor_bytes
+from sgsst_core.budget import Cache, content_fraction
 from sgsst_core.devices import Timer
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import ContentFeatures, ViewTarget
-from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, ShownGaussians
-from sgsst_core.parallel.division import Divider, Division, Piece, ScaledView, Shares, ViewImages
+from sgsst_core.parallel import (
+    ALONE,
+    Collectives,
+    Divider,
+    Division,
+    ImageExchange,
+    Piece,
+    ScaledView,
+    Shares,
+    ShownGaussians,
+    ViewImages,
+)
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions import ContentMaps, RegionMaps
 from sgsst_core.scene.camera import Camera
@@ -40,7 +50,7 @@ class ViewColors:
         self._degree = scene.sh_degree
         self._sh_rest = scene.sh_rest.to(device)
         self._means = scene.means.to(device)
-        self.cache: Cache[int, Tensor] = Cache(memory, tensor_bytes)
+        self.cache: Cache[int, Tensor] = Cache(memory)
 
     def __call__(self, index: int, sh_dc: Tensor) -> Tensor:
         """Return the colors [N, 3] of a view for `sh_dc` [N, 3]."""
@@ -118,7 +128,7 @@ class Views:
 
         It does not depend on which blend weights are cached, because it is cached itself over many steps.
         """
-        return self.render(index, self.colors(index, self._sh_dc), self.rasterizer.repeatable)
+        return self.render(index, self.colors(index, self._sh_dc), self.rasterizer.uncached)
 
     def window(self, index: int, make: Callable[[Camera], Tensor], *shape: int) -> Tensor:
         """Return this rank's rectangle [h, w, *shape] of a view, from a function of its camera.
@@ -212,7 +222,7 @@ class Views:
                     ones = torch.ones((camera.height, camera.width, 3))
                     mask = self.rasterizer.color_gradient(ones, camera)[:, 0] > 0
             with self.timer("communication"):
-                return ShownGaussians(self.collectives.union(mask))
+                return ShownGaussians(self.collectives.all_reduce(mask.int()) > 0)
 
         return self._shown.get(index, find, size)
 
@@ -471,7 +481,7 @@ class ViewTargets:
         return self._divisions[key]
 
     def _rendered_coverage(self, index: int) -> list[Tensor]:
-        window = self.views.window(index, self.views.rasterizer.repeatable.coverage)
+        window = self.views.window(index, self.views.rasterizer.uncached.coverage)
         return self.loss.targets.position_weights(self.views.whole(index, window))
 
     def _rendered_maps(self, index: int, render: Callable[[Camera], Tensor], count: int) -> list[list[Tensor]]:
@@ -498,4 +508,4 @@ def _image_bytes(view: ScaledView) -> int:
 
 
 def _pyramid_bytes(pyramid: list[Tensor]) -> int:
-    return sum(map(tensor_bytes, pyramid))
+    return sum(level.nbytes for level in pyramid)

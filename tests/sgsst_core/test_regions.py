@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import sos_reference
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import MaskError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
@@ -22,7 +23,6 @@ from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.quality.measure import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.regions import (
     ContentMaps,
     Region,
@@ -581,7 +581,7 @@ def test_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
     (used,) = stylizer.job.style.images
     assert used.shape == (60, 40, 3)
-    assert stylizer.job.loss.targets.style_scale == 2
+    assert stylizer.job.loss.style_scale == 2
     weights = stylizer.job.plan.survey.total_blend_weights
     (wanted,) = prepared_style(Style.of(style), settings, scene.sh_dc, weights).images
     assert torch.equal(used, wanted)

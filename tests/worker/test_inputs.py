@@ -18,7 +18,7 @@ from sgsst_core.files.formats import EXTRA_FORMATS
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.images import save_png
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.files.formats.samples import rewritten

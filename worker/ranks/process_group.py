@@ -26,7 +26,7 @@ from torch import Tensor
 from sgsst_core.errors import SgsstError
 from sgsst_core.features.statistics import LayerStatistics
 from sgsst_core.messages import decode, encode
-from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, ImageExchange, Traffic
+from sgsst_core.parallel import ALONE, Collectives, ImageExchange
 from worker.processes import interface_towards, listen, split_address
 
 T = TypeVar("T")
@@ -142,7 +142,6 @@ class ProcessGroupCollectives(Collectives):
     Args:
         timeout: Timeout of each exchange; see `process_group`.
         gpu_sharing: Largest number of ranks of the job on one GPU; 1 without GPUs.
-        sent: Counters of sent bytes to continue; None for new ones.
     """
 
     def __init__(
@@ -151,7 +150,6 @@ class ProcessGroupCollectives(Collectives):
         device: torch.device,
         timeout: timedelta,
         gpu_sharing: int = 1,
-        sent: dict[Traffic, int] | None = None,
     ) -> None:
         self.rank = dist.get_rank(group)
         self.size = dist.get_world_size(group)
@@ -159,7 +157,6 @@ class ProcessGroupCollectives(Collectives):
         self._device = device
         self.gpu_sharing = gpu_sharing
         self._timeout = timeout
-        self.sent: dict[Traffic, int] = dict.fromkeys(TRAFFIC, 0) if sent is None else sent
         self._halves: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
         self.local_size = self.all_gather(_machine()).count(_machine())
 
@@ -205,22 +202,16 @@ class ProcessGroupCollectives(Collectives):
             for images in (sent, received)
         )
         into = flat.new_empty(sum(expected))
-        self.sent["image"] += flat.nbytes
         dist.all_to_all_single(into, flat, expected, counts, group=self._group)
         values = iter(into.split([image[rank].numel() for rank in others for image in received]))
         for rank in range(self.size):
             for source, target in zip(sent, received, strict=True):
                 yield target[rank], source[rank] if rank == self.rank else next(values).view_as(target[rank])
 
-    def union(self, mask: Tensor) -> Tensor:
+    def all_reduce(self, tensor: Tensor) -> Tensor:
         """See `Collectives`."""
-        return self.all_reduce(mask.to(torch.uint8), operation=dist.ReduceOp.MAX).bool()
-
-    def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient", operation: Any = dist.ReduceOp.SUM) -> Tensor:
-        """See `Collectives`. The operation is that of torch.distributed."""
         tensor = tensor.contiguous()
-        self.sent[traffic] += 2 * (self.size - 1) * tensor.nbytes // self.size
-        dist.all_reduce(tensor, operation, group=self._group)
+        dist.all_reduce(tensor, group=self._group)
         return tensor
 
     def all_reduce_statistics(
@@ -236,13 +227,13 @@ class ProcessGroupCollectives(Collectives):
         kernels would be longer than the exchange.
         """
         if not parts:
-            return [], self.all_reduce(numbers, "statistics")
+            return [], self.all_reduce(numbers)
         indices: dict[int, list[int]] = {}
         for index, part in enumerate(parts):
             indices.setdefault(len(part.mean), []).append(index)
         stacks = [_stacked([parts[index] for index in some]) for some in indices.values()]
         sums = [torch.cat([stack.count, stack.count * stack.mean], dim=1) for stack in stacks]
-        flat = self.all_reduce(torch.cat([*(each.flatten() for each in sums), numbers]), "statistics")
+        flat = self.all_reduce(torch.cat([*(each.flatten() for each in sums), numbers]))
         *totals, added = flat.split([*(each.numel() for each in sums), len(numbers)])
         counts, means, moments = [], [], []
         for stack, total in zip(stacks, totals, strict=True):
@@ -254,7 +245,7 @@ class ProcessGroupCollectives(Collectives):
             moments.append(moment[:, rows, columns])  # symmetric: one triangle is enough
             counts.append(count)
             means.append(mean)
-        halves = self.all_reduce(torch.cat([each.flatten() for each in moments]), "statistics")
+        halves = self.all_reduce(torch.cat([each.flatten() for each in moments]))
         merged: dict[int, LayerStatistics] = {}
         values = halves.split([each.numel() for each in moments])
         for some, count, mean, half in zip(indices.values(), counts, means, values, strict=True):
@@ -325,7 +316,7 @@ class ProcessGroupCollectives(Collectives):
         group = dist.new_group(list(ranks), timeout=max(self._timeout, PREPARING))
         if self.rank not in ranks:
             return None
-        return ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing, self.sent)
+        return ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing)
 
 
 def _machine() -> tuple[str, str]:

@@ -25,7 +25,7 @@ def test_this_machine_works(tiny_installed: Path) -> None:
     assert [finding for finding in findings if finding.state == "problem"] == []
     topics = [finding.topic for finding in findings]
     assert topics == ["weights", "cache", "program", "GPU", "memory", "rasterizer", "precision", "results", "kernels"]
-    assert "5 checks agree" in findings[-2].text
+    assert "checks pass" in findings[-2].text
 
 
 @pytest.mark.slow
@@ -52,8 +52,9 @@ def test_wrong_images_are_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     render = CpuRasterizer._render
     monkeypatch.setattr(CpuRasterizer, "_render", lambda *arguments: 1.001 * render(*arguments))
     checks = {check.name: check for check in check_device("cpu", CPU, **SMALL)}
-    assert [name for name, check in checks.items() if not check.passed] == ["image"]
-    (finding,) = device_checks._results("cpu", CPU)
+    failed = {name for name, check in checks.items() if not check.passed}
+    assert {"image", "coverage"} <= failed <= {"image", "coverage", "gradient"}
+    finding, *_ = device_checks._results("cpu", CPU)
     assert finding.state == "problem"
     assert finding.text.startswith("wrong image: 0.00")
 

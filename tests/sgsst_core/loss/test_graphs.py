@@ -12,7 +12,7 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.graphs import LossGraphs, can_be_captured, can_use_graphs
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.terms import StyleTargets, ViewTarget
-from sgsst_core.parallel.division import Tiling
+from sgsst_core.parallel import Tiling
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer

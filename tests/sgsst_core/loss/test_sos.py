@@ -12,27 +12,31 @@ from benchmarks.stability.sos_reference import StyledWeights, sos_reference, sty
 from sgsst_core.errors import ImageError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.statistics import layer_statistics
-from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss import terms as nearest
-from sgsst_core.loss.feature_scale import (
+from sgsst_core.features.vgg import (
+    CONTENT_LAYER,
     EVEN_COLOR_SCALE,
     EVEN_PIXEL_SCALE,
     EVEN_SCALE,
+    PIXELS,
     PUBLISHED,
+    STYLE_LAYERS,
+    FeatureNetwork,
     at_scale,
     paper_scales,
     with_scales,
 )
+from sgsst_core.loss import terms as nearest
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import (
     MAX_VECTORS,
-    ContentDifference,
     LayerTarget,
     Matches,
     StyleVectors,
     TermWeights,
     combined,
     content_factor,
+    content_gradient,
+    content_loss,
     layers_of,
     search,
     style_loss,
@@ -269,24 +273,20 @@ def test_content_gradient_agrees_with_autograd(weighted):
     x, content = make_features(9, 11, 6, 1).requires_grad_(), make_features(9, 11, 6, 2)
     a = torch.rand((9, 11), dtype=torch.float64) if weighted else torch.ones((9, 11), dtype=torch.float64)
     expected = 0.7 * (a[:, :, None] * (x - content) ** 2).sum() / (a.sum() * 6)
-    actual = ContentDifference.of(
-        x.detach(), content, content_factor(a.sum(), x.shape[-1], 0.7), a if weighted else None
-    )
-    assert float(actual.loss()) == pytest.approx(expected.item(), rel=1e-12)
-    torch.testing.assert_close(actual.gradient(), torch.autograd.grad(expected, x)[0], rtol=1e-12, atol=0)
+    case = x.detach(), content, a if weighted else None, content_factor(a.sum(), x.shape[-1], 0.7)
+    assert float(content_loss(*case)) == pytest.approx(expected.item(), rel=1e-12)
+    torch.testing.assert_close(content_gradient(*case), torch.autograd.grad(expected, x)[0], rtol=1e-12, atol=0)
 
 
 def test_loss_and_gradient_are_zero_without_positions():
     x = make_features(17, 23, 12, 1, torch.float32)
     nowhere = torch.zeros((17, 23))
     terms, gradient = style_loss(layer_statistics(x, nowhere), LayerTarget.of(layer_statistics(x)))
-    content = ContentDifference.of(
-        x, 2 * x, content_factor(nowhere.sum(dtype=torch.float64), x.shape[-1], 0.7), nowhere
-    )
+    case = x, 2 * x, nowhere, content_factor(nowhere.sum(dtype=torch.float64), x.shape[-1], 0.7)
     assert not terms.any()
     assert not gradient.apply(x, torch.ones((17, 23))).any()
-    assert float(content.loss()) == 0.0
-    assert not content.gradient().any()
+    assert float(content_loss(*case)) == 0.0
+    assert not content_gradient(*case).any()
 
 
 EPS = torch.finfo(torch.float64).eps

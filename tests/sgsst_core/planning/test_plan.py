@@ -19,8 +19,7 @@ from sgsst_core.devices import seconds_left
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.parallel.division import Size, Tiling
+from sgsst_core.parallel import ALONE, Size, Tiling
 from sgsst_core.planning.facts import Device, Facts, Machine, describe_machine, evaluated_pixels
 from sgsst_core.planning.plan import Plan, choose_precision, make_plan, with_groups
 from sgsst_core.planning.survey import Survey

@@ -12,6 +12,7 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from benchmarks.methods import VggLpips
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import load_perceptual
@@ -26,7 +27,6 @@ from sgsst_core.quality.judge import (
     ssim,
 )
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import resize_area, style_size

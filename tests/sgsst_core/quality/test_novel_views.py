@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import box_average_reference, features_reference
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, COLOR_OFFSET, SH_C0
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
 from sgsst_core.loss.sos import SosLoss
@@ -206,7 +207,7 @@ def test_gram_distance_agrees_with_float64(tiny_weights, network, scene: Scene, 
     measured = novel_views(scene, views, network, coarsest=COARSEST, weighted=weighted)
     assert measured.views == [0, 1, 2, 3]
     sh_dc = 4 * scene.sh_dc  # colors far outside 0 to 1
-    reference = make_rasterizer("reference", scene, background=(0.2, 0.3, 0.4))
+    reference = ReferenceRasterizer(scene, background=(0.2, 0.3, 0.4))
     painting = resize_area(style(), style_size((96, 80), (48, 64)))
     expected: dict[int, float] = {0: 0.0, 1: 0.0}
     for first, second in itertools.pairwise(views[:5]):

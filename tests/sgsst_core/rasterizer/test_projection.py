@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.stability.splat_reference import splat
 from sgsst_core.constants import EPS2D
-from sgsst_core.rasterizer.projection import (
+from sgsst_core.rasterizer.cpu import (
     Column,
+    CpuRasterizer,
     project,
 )
-from sgsst_core.rasterizer.reference import splat
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
@@ -89,7 +90,7 @@ def test_compensation_matches_exact_arithmetic(length: float) -> None:
 
 def test_near_plane_must_be_positive() -> None:
     with pytest.raises(ValueError, match="must be positive"):
-        project(cloud(3), camera(), near=0.0)
+        CpuRasterizer(cloud(3), near=0.0)
 
 
 def test_gaussians_without_a_projection_are_dropped() -> None:

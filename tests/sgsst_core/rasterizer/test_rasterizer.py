@@ -13,17 +13,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.stability.splat_reference import ReferenceRasterizer, splat
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
-from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.projection import (
+from sgsst_core.rasterizer.cpu import (
+    CpuRasterizer,
     project,
 )
-from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering
@@ -45,7 +45,6 @@ from tests.sgsst_core.splat_scenes import (
 CLOSE = 2e-5
 #: Rasterizers of the CPU; `test_triton.py` compares `cached`, which runs in Triton's interpreter here.
 ALL = [name for name, kind in RASTERIZERS.items() if not kind.on_gpu and name != "cached"]
-OTHERS = [name for name in ALL if name != "reference"]
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "cloud": lambda: (cloud(), camera()),
@@ -81,15 +80,14 @@ def test_survey_equals_coverage_and_gradient_of_ones(case: tuple[Scene, Camera])
     reference = ReferenceRasterizer(scene)
     band = reference.near_cutoff(view, CLOSE)
     expected, summed = reference.survey(view)
-    for name in OTHERS:
-        fast = make_rasterizer(name, scene)
-        coverage, weights = fast.survey(view)
-        separate = Rasterizer.survey(fast.uncached, view)
-        assert torch.equal(coverage, separate[0])
-        assert torch.equal(weights, separate[1])
-        assert_close_outside_band(coverage, expected, band, tolerance=1e-4)
-        # At a pixel where a cutoff flips, a weight of at most 1 moves from one Gaussian to others.
-        assert float((weights - summed).abs().max()) <= 1e-4 * float(summed.max()) + 2 * int(band.sum())
+    fast = CpuRasterizer(scene)
+    coverage, weights = fast.survey(view)
+    separate = Rasterizer.survey(fast, view)
+    assert torch.equal(coverage, separate[0])
+    assert torch.equal(weights, separate[1])
+    assert_close_outside_band(coverage, expected, band, tolerance=1e-4)
+    # At a pixel where a cutoff flips, a weight of at most 1 moves from one Gaussian to others.
+    assert float((weights - summed).abs().max()) <= 1e-4 * float(summed.max()) + 2 * int(band.sum())
 
 
 def assert_agree(scene: Scene, view: Camera, background: tuple[float, float, float]) -> None:
@@ -100,14 +98,13 @@ def assert_agree(scene: Scene, view: Camera, background: tuple[float, float, flo
     pixels[band] = 0
     image, coverage = reference.render(colors, view), reference.coverage(view)
     expected = reference.color_gradient(pixels, view)
-    for name in OTHERS:
-        fast = make_rasterizer(name, scene, background=background)
-        assert_close_outside_band(fast.render(colors, view), image, band, tolerance=1e-4)
-        assert_close_outside_band(fast.coverage(view), coverage, band, tolerance=1e-4)
-        actual = fast.color_gradient(pixels, view)
-        assert actual.dtype == torch.float32
-        assert relative_error(actual, expected) < 1e-5
-        assert float((actual - expected).abs().max()) <= 1e-5 * float(expected.abs().max())
+    fast = CpuRasterizer(scene, background=background)
+    assert_close_outside_band(fast.render(colors, view), image, band, tolerance=1e-4)
+    assert_close_outside_band(fast.coverage(view), coverage, band, tolerance=1e-4)
+    actual = fast.color_gradient(pixels, view)
+    assert actual.dtype == torch.float32
+    assert relative_error(actual, expected) < 1e-5
+    assert float((actual - expected).abs().max()) <= 1e-5 * float(expected.abs().max())
 
 
 def test_reference_agrees_with_a_loop_over_pixels() -> None:
@@ -174,8 +171,7 @@ def test_crops_of_a_view_make_up_the_whole_view(name: str, row: int, column: int
     assert relative_error(gradient, rasterizer.color_gradient(pixels, view)) < 1e-6
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
     scene, view = cloud(2000, seed=13), camera(200, 120)
     colors, pixels = colors_of(scene), pixels_like(view)
     before = torch.get_num_threads()
@@ -183,7 +179,7 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
     try:
         for threads in (1, 2, 2):
             torch.set_num_threads(threads)
-            rasterizer = make_rasterizer(name, scene)
+            rasterizer = CpuRasterizer(scene)
             image, gradient = rasterizer.render(colors, view), rasterizer.color_gradient(pixels, view)
             results.append((image, gradient, *rasterizer.survey(view)))
     finally:

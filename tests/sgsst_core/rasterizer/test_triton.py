@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import Rasterizer, drawing_problem, make_rasterizer
 from sgsst_core.rasterizer.base import Precision
-from sgsst_core.rasterizer.projection import build_tile_intersections
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.rasterizer.cpu import build_tile_intersections
 from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -127,7 +127,7 @@ def test_invalid_gaussians_are_dropped_as_by_reference() -> None:
 
 
 def test_too_many_intersections_are_refused_before_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sgsst_core.rasterizer.projection.MAX_INTERSECTIONS", 10)
+    monkeypatch.setattr("sgsst_core.rasterizer.cpu.MAX_INTERSECTIONS", 10)
     with pytest.raises(TooManyIntersectionsError, match="raster tiles"):
         on_device(cloud(200)).intersections(camera())
 
@@ -266,7 +266,7 @@ def test_weights_beyond_the_budget_are_recomputed_on_the_device() -> None:
         for view in views:
             cached.coverage(view)
         assert [is_cached(cached, view) for view in views] == [True, True, False]
-        assert cached.cached_bytes == budget
+        assert cached.caches["weights"].used == budget
     assert torch.equal(cached.render(colors, views[2]), uncached.render(colors, views[2]))
     gradient = cached.color_gradient(pixels_like(views[2]), views[2])
     assert torch.equal(gradient, uncached.color_gradient(pixels_like(views[2]), views[2]))

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.camera_files import _colmap_lens
 from sgsst_core.files.camera_folder import ColmapCamera
 from sgsst_core.files.images import undistort
 from sgsst_core.quality.novel_views import neighbors
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import (
     FACES,
     OVERLAP,

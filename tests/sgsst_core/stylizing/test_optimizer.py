@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import sos_reference
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.judge import saturated
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.regions import Regions
 from sgsst_core.scene.colors import LARGEST, gray, luminance, resize_area, style_size
 from sgsst_core.scene.gaussians import Scene

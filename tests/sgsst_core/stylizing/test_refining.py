@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core import refine as module
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.parallel import Collectives
 from sgsst_core.planning.survey import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import (
     MAX_PIECES,
     MIN_PSNR,

@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.budget import Cache
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.files.images import Color
 from sgsst_core.progress import Progress
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scales import smoothed
 from sgsst_core.scene.colors import downscale
 from sgsst_core.scene.gaussians import Scene

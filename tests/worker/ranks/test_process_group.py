@@ -26,7 +26,7 @@ from sgsst_core.features.statistics import LayerStatistics, layer_statistics
 from sgsst_core.files.images import Photo
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.messages import decode, encode
-from sgsst_core.parallel.collectives import Collectives, ImageExchange, same_on_all
+from sgsst_core.parallel import Collectives, ImageExchange
 from sgsst_core.planning.facts import Machine
 from sgsst_core.progress import Decision
 from sgsst_core.scene.camera import Camera, Lens
@@ -186,8 +186,6 @@ def values(collectives: Collectives, groups: int) -> dict[str, Any]:
     return {
         "all_gather": collectives.all_gather(collectives.rank),
         "broadcast": collectives.broadcast(lambda: f"made by {collectives.rank}"),
-        "same": same_on_all(collectives, 5),
-        "different": same_on_all(collectives, collectives.rank),
         "group": (group.rank, group.size, group.all_gather(collectives.rank)),
         "all_reduce": float(collectives.all_reduce(torch.tensor([float(collectives.rank)]))),
         "local": collectives.local_size,
@@ -199,8 +197,6 @@ def test_collectives_and_groups_follow_their_definitions(groups: int) -> None:
     each = 4 // groups
     for rank, result in enumerate(on_ranks(4, values, groups)):
         assert (result["all_gather"], result["broadcast"]) == ([0, 1, 2, 3], "made by 0")
-        assert result["same"]
-        assert not result["different"]
         assert (result["all_reduce"], result["local"]) == (6.0, 4)
         first = rank - rank % each
         assert result["group"] == (rank % each, each, list(range(first, first + each)))

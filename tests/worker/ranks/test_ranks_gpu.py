@@ -10,7 +10,7 @@ import torch.multiprocessing as multiprocessing
 from torch import Tensor
 
 from sgsst_core.features.network_weights import load_network_weights
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights

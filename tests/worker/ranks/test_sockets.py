@@ -12,7 +12,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.parallel import Collectives
 from tests.worker.ranks.faults import name_of, small_request
 from tests.worker.ranks.spawn import on_ranks
 from tests.worker.ranks.test_attempts import command, start

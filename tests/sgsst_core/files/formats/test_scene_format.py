@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import (
@@ -74,7 +75,7 @@ def test_transformed_scene_and_camera_give_the_same_image(scale: float) -> None:
         (applied(Frame.of(moved), scene), replace(view, world_to_camera=pose)),
     ):
         near = 0.2 if seen is view else 0.2 * scale
-        images.append(make_rasterizer("reference", each, near=near).render(scene_colors(each, seen), seen))
+        images.append(ReferenceRasterizer(each, near=near).render(scene_colors(each, seen), seen))
     assert float((images[0] - images[1]).abs().max()) < 2e-4
 
 

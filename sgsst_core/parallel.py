@@ -1,4 +1,8 @@
-"""Division of views into partition tiles and among ranks, and each rank's pixels of a view at its scales.
+"""Communication between the ranks of a job, and the division of views into partition tiles and among ranks.
+
+`worker.ranks.process_group` has the operations of several ranks. Every rank calls the same methods in the same order.
+Results that are "identical on all ranks" are bit-identical, so all ranks reach the same decisions based on such results
+without further messages.
 
 Every rank computes the whole division from the same numbers, so no messages are needed. The division affects only the
 rounding of results, because partition tiles give exact gradients for any division.
@@ -8,13 +12,18 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+import zlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sgsst_core.devices import Timer
+from sgsst_core.errors import RanksDriftedError
 from sgsst_core.features.partition import (
     PartitionTile,
     Rectangle,
@@ -24,10 +33,203 @@ from sgsst_core.features.partition import (
     partition,
     scaled_region,
 )
+from sgsst_core.features.statistics import LayerStatistics
 from sgsst_core.features.vgg import ALIGNMENT, layer_stride
-from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange
 from sgsst_core.scales import EVEN, ScaleWeights, scale_count
 from sgsst_core.scene.colors import add_upscaled_, downscale
+from sgsst_core.settings import Settings
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ImageExchange:
+    """Rectangles of an image that ranks have and need.
+
+    Attributes:
+        parts: Rectangle of each rank's part; they are disjoint.
+        windows: Rectangle that each rank needs; may be empty.
+    """
+
+    parts: Sequence[Rectangle]
+    windows: Sequence[Rectangle]
+
+    def in_part(self, part: Tensor, rank: int, other: int) -> Tensor:
+        """Return the pixels [h, w, ...] of a rank's part that are in another rank's window."""
+        return part[self.parts[rank].intersection(self.windows[other]).within(self.parts[rank]).slices]
+
+    def in_window(self, window: Tensor, rank: int, other: int) -> Tensor:
+        """Return the pixels [h, w, ...] of a rank's window that are in another rank's part."""
+        return window[self.windows[rank].intersection(self.parts[other]).within(self.windows[rank]).slices]
+
+
+class Collectives:
+    """Collective operations of one rank in a group of ranks; this class implements them for a single rank.
+
+    Attributes:
+        local_size: Number of ranks on this machine, including this one.
+        gpu_sharing: Largest number of ranks on one GPU; 1 without GPUs.
+    """
+
+    rank: int = 0
+    size: int = 1
+    local_size: int = 1
+    gpu_sharing: int = 1
+
+    def gather_parts(
+        self, exchanges: Sequence[ImageExchange], parts: Sequence[Tensor], windows: Sequence[Tensor]
+    ) -> None:
+        """Fill each rank's windows of some images from every rank's parts of them.
+
+        Args:
+            exchanges: Rectangles of the parts and windows of each image.
+            parts: [h, w, ...], part of this rank of each image.
+            windows: [h, w, ...], window of this rank of each image. Pixels in no part are left unchanged.
+        """
+        raise NotImplementedError("a single rank has whole images")
+
+    def reduce_parts(self, exchanges: Sequence[ImageExchange], windows: Sequence[Tensor]) -> list[Tensor]:
+        """Return this rank's part [h, w, ...] of the sum of all ranks' windows, for each image.
+
+        This is the adjoint of `gather_parts`.
+        """
+        raise NotImplementedError("a single rank has whole images")
+
+    def all_reduce(self, tensor: Tensor) -> Tensor:
+        """Return the sum over all ranks, identical on all ranks. The argument may be overwritten."""
+        return tensor
+
+    def all_reduce_statistics(
+        self, parts: Sequence[LayerStatistics], numbers: Tensor
+    ) -> tuple[list[LayerStatistics], Tensor]:
+        """Merge all ranks' statistics of disjoint positions, and sum their numbers; identical on all ranks.
+
+        Args:
+            parts: Statistics of this rank's positions, such as of each layer at each scale.
+            numbers: [k] float64, numbers to sum over the ranks.
+
+        Returns:
+            Merged statistics in the order of `parts`, and the sums [k] float64.
+        """
+        return list(parts), numbers
+
+    def all_gather(self, value: T) -> list[T]:
+        """Return every rank's value in rank order, identical on all ranks.
+
+        Values should be small. Allowed are scalars, strings, lists, tuples, dicts, paths, arrays, tensors, and this
+        project's dataclasses and errors.
+        """
+        return [value]
+
+    def broadcast(self, make: Callable[[], T]) -> T:
+        """Call `make` on rank 0 only, and return its result on all ranks; an `SgsstError` is raised on all ranks."""
+        return make()
+
+    def set_timeout_for(self, iteration_seconds: float) -> None:
+        """Set the timeout of collectives for iterations of this length.
+
+        After this call, all ranks communicate in every iteration, and a rank that is late by much more than an
+        iteration counts as failed. Before this call, the timeout is long enough for the preparation of a job.
+        """
+
+    def split_group(self, groups: int) -> Collectives:
+        """Split the ranks into `groups` equal groups of consecutive ranks, and return this rank's group.
+
+        Every rank must call this at the same point.
+        """
+        return self
+
+
+ALONE = Collectives()
+
+
+#: If a view shows more than this fraction of all Gaussians, the whole gradient is sent: gathering and scattering values
+#: would take more time than sending fewer values saves.
+DENSE_FRACTION = 0.7
+
+
+class ShownGaussians:
+    """Set of Gaussians, one bit each.
+
+    Each view's set is stored for the whole job: 4 million Gaussians take 0.5 MB, while their indices would take up to
+    32 MB.
+
+    Args:
+        mask: [N] bool, on any device; the bits are stored on the same device.
+    """
+
+    def __init__(self, mask: Tensor) -> None:
+        self.total = len(mask)
+        self.count = int(mask.sum())
+        whole = torch.nn.functional.pad(mask.to(torch.uint8), (0, -self.total % 8))
+        self._bits = (whole.view(-1, 8) << _bit_positions(mask.device)).sum(dim=1, dtype=torch.uint8)
+
+    @staticmethod
+    def nbytes(gaussians: int) -> int:
+        """Return the size in bytes of a set, for a scene with this many Gaussians."""
+        return -(-gaussians // 8)
+
+    @property
+    def sparse(self) -> bool:
+        """Whether only the gradients of Gaussians in the set are sent, instead of all gradients."""
+        return self.count <= DENSE_FRACTION * self.total
+
+    def indices(self) -> Tensor:
+        """Return the indices [count] int64 in ascending order, without synchronizing with a GPU."""
+        if self._bits.device.type == "cpu":  # on a CPU, NumPy is an order of magnitude faster
+            flags = np.unpackbits(self._bits.numpy(), count=self.total, bitorder="little")
+            return torch.from_numpy(np.flatnonzero(flags))
+        mask = (self._bits[:, None] >> _bit_positions(self._bits.device)).bitwise_and_(1).view(-1)[: self.total]
+        return torch.nonzero_static(mask, size=self.count)[:, 0]
+
+
+def _bit_positions(device: torch.device) -> Tensor:
+    """Return the positions of the bits in a byte."""
+    return torch.arange(8, dtype=torch.uint8, device=device)
+
+
+#: Steps between two checks that all ranks have the same colors.
+DRIFT_STEPS = 50
+
+
+class Team:
+    """Ranks of a job, and the position of this rank among them.
+
+    Attributes:
+        groups: Number of groups that these ranks form; each group processes its own views.
+        group: Ranks that process the same views as this one.
+    """
+
+    def __init__(self, settings: Settings, collectives: Collectives) -> None:
+        self.everybody = collectives
+        self.groups = math.gcd(settings.views_per_step, collectives.size)
+        self.group = collectives.split_group(self.groups)
+
+    def expect(self, seconds: float) -> None:
+        """Set the timeouts of the ranks for steps that take so many seconds."""
+        for ranks in (self.everybody, self.group):
+            ranks.set_timeout_for(seconds)
+
+    @property
+    def own_group(self) -> int:
+        """Index of this rank's group."""
+        return self.everybody.rank // self.group.size
+
+    def check_drift(self, step: int, colors: Tensor) -> None:
+        """Check every `DRIFT_STEPS` steps that all ranks have the same colors [n, 3].
+
+        Raises:
+            RanksDriftedError: If they differ.
+        """
+        if self.everybody.size == 1 or step % DRIFT_STEPS:
+            return
+        checksum = zlib.crc32(colors.detach().cpu().numpy().tobytes())
+        if len(set(self.everybody.all_gather(checksum))) > 1:
+            raise RanksDriftedError(
+                f"Step {step}: the ranks' colors are no longer the same. They compute differently: run on "
+                "machines of one kind, with the same versions of this program and of PyTorch."
+            )
+
 
 Size = tuple[int, int]  # height, width in pixels
 
@@ -69,12 +271,14 @@ class Shares:
         scale: Finest computed scale; no rank needs pixels of its pieces of it from another rank.
         parts: Each rank's piece of the finest scale. They are disjoint and contain every covered pixel.
         windows: Each rank's part and its halo, which the rank renders.
+        halo: Width in pixels of the halo around a tile.
     """
 
     size: Size
     scale: int
     parts: tuple[Rectangle, ...]
     windows: tuple[Rectangle, ...]
+    halo: int
 
     @staticmethod
     def of(size: Size, by_rank: Sequence[Sequence[Piece]], halo: int) -> Shares:
@@ -86,6 +290,7 @@ class Shares:
             scale,
             tuple(piece.region.at_full_size(scale) if piece else _NOTHING for piece in own),
             tuple(piece.tile(halo).outer.at_full_size(scale) if piece else _NOTHING for piece in own),
+            halo,
         )
 
     def exchanged_scale(self, scale: int) -> int:
@@ -95,7 +300,7 @@ class Shares:
         """
         return min(scale, self.scale + ALIGNMENT.bit_length() - 1)
 
-    def exchanges(self, by_rank: Sequence[Sequence[Piece]], halo: int) -> dict[int, ImageExchange]:
+    def exchanges(self, by_rank: Sequence[Sequence[Piece]]) -> dict[int, ImageExchange]:
         """Return the exchange of each image, by its scale, that gives ranks their pieces of coarser scales."""
         coarser = [[piece for piece in pieces if piece.scale != self.scale] for pieces in by_rank]
         scales = sorted({self.exchanged_scale(piece.scale) for pieces in coarser for piece in pieces})
@@ -103,19 +308,19 @@ class Shares:
             scale: ImageExchange(
                 tuple(part.at_scale(scale) for part in self.parts),
                 tuple(
-                    self._window([p for p in pieces if self.exchanged_scale(p.scale) == scale], halo, scale)
+                    self._window([p for p in pieces if self.exchanged_scale(p.scale) == scale], scale)
                     for pieces in coarser
                 ),
             )
             for scale in scales
         }
 
-    def _window(self, pieces: Sequence[Piece], halo: int, scale: int) -> Rectangle:
+    def _window(self, pieces: Sequence[Piece], scale: int) -> Rectangle:
         """Return the rectangle of an exchanged image that contains the pixels of some pieces and of their halos."""
         pieces = [piece for piece in pieces if piece.region.pixels]
         if not pieces:
             return _NOTHING
-        outer = [piece.tile(halo).outer.at_full_size(piece.scale - scale) for piece in pieces]
+        outer = [piece.tile(self.halo).outer.at_full_size(piece.scale - scale) for piece in pieces]
         # Edges between the pixels of the coarsest of these scales, or at the border of the view.
         step = 1 << max(piece.scale for piece in pieces) - scale
         height, width = self.size[0] >> scale, self.size[1] >> scale
@@ -207,16 +412,12 @@ def _splits(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
     """Return all ways to split a piece in two: at every 16th row or column, or not at all."""
     area = piece.region
     splits = _whole(piece)
-
-    def part(region: Rectangle) -> Piece:
-        return Piece(piece.scale, piece.size, region)
-
     for row in range(area.top + ALIGNMENT, area.bottom, ALIGNMENT):  # rows first, because they are contiguous in memory
-        upper = part(Rectangle(area.top, area.left, row, area.right))
-        splits.append((upper, part(Rectangle(row, area.left, area.bottom, area.right))))
+        upper = replace(piece, region=Rectangle(area.top, area.left, row, area.right))
+        splits.append((upper, replace(piece, region=Rectangle(row, area.left, area.bottom, area.right))))
     for column in range(area.left + ALIGNMENT, area.right, ALIGNMENT):
-        left = part(Rectangle(area.top, area.left, area.bottom, column))
-        splits.append((left, part(Rectangle(area.top, column, area.bottom, area.right))))
+        left = replace(piece, region=Rectangle(area.top, area.left, area.bottom, column))
+        splits.append((left, replace(piece, region=Rectangle(area.top, column, area.bottom, area.right))))
     return splits
 
 
@@ -272,11 +473,9 @@ class Tiling:
 
         Tiles are as large as the memory budget allows.
         """
-        tile_size = self.tile_size
-        if tile_size is None:
-            tile_size = choose_tile_size(
-                *size, self.halo, held=self.held, working=self.working, region=region, largest=self.largest
-            )
+        tile_size = self.tile_size or choose_tile_size(
+            *size, self.halo, held=self.held, working=self.working, region=region, largest=self.largest
+        )
         return partition(*size, tile_size, self.halo, region)
 
     def cached(self, areas: Sequence[int]) -> list[bool]:
@@ -295,13 +494,11 @@ class Division:
         pieces: For each scale, the pieces of every rank; identical on all ranks.
         tiles: Partition tiles of this rank by scale.
         shares: Rectangles that the ranks render; None if every rank has the whole image.
-        halo: Width in pixels of the halo around a tile; only used with `shares`.
     """
 
     pieces: dict[int, tuple[tuple[Piece, ...], ...]]
     tiles: dict[int, list[PartitionTile]]
     shares: Shares | None = None
-    halo: int = 0
 
     def cost(self, rank: int, halo: int) -> int:
         """Return the number of pixels that a rank passes through the network."""
@@ -356,7 +553,7 @@ class Divider:
             by_rank = self._divided(size, scales, region, rendered=False)
         sizes = {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
         weights = {scale: coverage[scale] if coverage else None for scale in scales}
-        return replace(self._division(by_rank, sizes, weights), shares=shares, halo=self.tiling.halo)
+        return replace(self._division(by_rank, sizes, weights), shares=shares)
 
     def shares(self, size: Size, region: Rectangle | None) -> Shares:
         """Return the rectangles that the ranks render of a view; see `divide_view`."""
@@ -387,13 +584,6 @@ class Divider:
                 for scale in sizes
             },
         )
-
-    def tiles(self, size: Size, coverage: Tensor | None = None) -> list[PartitionTile]:
-        """Return the partition tiles of a scaled view of size (height, width).
-
-        If `coverage` [h, w] is given, pixels with coverage 0 may not belong to any tile.
-        """
-        return self._partition(self._piece(0, size, coverage), coverage)
 
     def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
         """Return the piece of one scale that contains all pixels that the network has to process."""
@@ -475,7 +665,7 @@ class ViewImages:
         self._coarse: dict[int, _Pixels] = {}
         if shares is not None and any(scale != shares.scale for scale in division.pieces):
             by_rank = [list(itertools.chain(*own)) for own in zip(*division.pieces.values(), strict=True)]
-            self._exchanges = shares.exchanges(by_rank, division.halo)
+            self._exchanges = shares.exchanges(by_rank)
             #: This rank's part of the view, relative to its window.
             self._part = shares.parts[collectives.rank].within(self._own.area)
             self._gather(background)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.parallel.division import Piece, Shares, divide
+from sgsst_core.parallel import Piece, Shares, divide
 
 HALO = 64
 
@@ -58,7 +58,7 @@ def test_coarse_scales_are_spread_over_the_ranks() -> None:
     """Each rank has one piece of a coarser scale at most, and needs little of the exchanged images."""
     size = 3361, 5187
     by_rank = divide(view(*size, 4), HALO, 8)
-    exchanges = Shares.of(size, by_rank, HALO).exchanges(by_rank, HALO)
+    exchanges = Shares.of(size, by_rank, HALO).exchanges(by_rank)
     assert max(map(len, by_rank)) == 2
     received = [0] * 8
     for exchange, rank, other in itertools.product(exchanges.values(), range(8), range(8)):

@@ -6,12 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from sgsst_core import painting
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import CameraError
 from sgsst_core.orbit import orbit
-from sgsst_core.painting import solver, spreading
-from sgsst_core.painting.solver import PaintedColors, PaintedView, paint
-from sgsst_core.painting.spreading import Spreading
+from sgsst_core.painting import PaintedColors, PaintedView, Spreading, paint
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -50,14 +49,14 @@ def test_colors_are_those_of_dense_least_squares(scene: Scene) -> None:
     camera = cameras_of(scene)[0]
     image = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(5)) * 0.2 + 0.4
     problem = PaintedColors(scene, [full(camera, image)], make_rasterizer("cpu", scene))
-    solved = problem.solve(problem.original, bounded=False, iterations=200)
+    solved, residual = problem.solve(problem.original, bounded=False, iterations=200)
     weights, rest = blend_weights(scene, camera), rest_colors(scene.sh_rest, scene.means, camera).double()
-    ridge = solver.RELATIVE_RIDGE * weights.sum(dim=0) + solver.RIDGE
+    ridge = painting.RELATIVE_RIDGE * weights.sum(dim=0) + painting.RIDGE
     original = COLOR_OFFSET + SH_C0 * scene.sh_dc.double()
     right = weights.T @ (image.double().flatten(0, 1) - weights @ rest) + ridge[:, None] * original
     wanted = torch.linalg.solve(weights.T @ weights + ridge.diag(), right)
-    assert torch.allclose(solved.colors.double(), wanted, atol=2e-4)
-    assert solved.residual < 1e-4
+    assert torch.allclose(solved.double(), wanted, atol=2e-4)
+    assert residual < 1e-4
 
 
 def test_unchanged_picture_changes_nothing(scene: Scene) -> None:
@@ -98,7 +97,7 @@ def test_clamped_colors_can_rise(scene: Scene) -> None:
     black = replace(scene, sh_dc=torch.full_like(scene.sh_dc, -5.0))
     camera, rasterizer = cameras_of(scene)[0], make_rasterizer("cpu", scene)
     problem = PaintedColors(black, [full(camera, torch.full((camera.height, camera.width, 3), 0.4))], rasterizer)
-    assert problem.psnr(problem.solve(problem.original).colors) > problem.psnr(problem.original) + 3
+    assert problem.psnr(problem.solve(problem.original)[0]) > problem.psnr(problem.original) + 3
 
 
 def test_view_of_nothing_is_refused(scene: Scene) -> None:
@@ -120,13 +119,13 @@ def test_map_of_colors_reaches_everywhere() -> None:
 def neighbors_of_gray(means: Tensor, confidence: Tensor, change: Tensor) -> Tensor:
     """Return the change of all Gaussians of one color by a plain search for the neighbors of each, in float64."""
     low, high = torch.quantile(means, torch.tensor([0.1, 0.9], dtype=torch.float64), dim=0)
-    known = confidence > spreading._LEAST
+    known = confidence > painting._LEAST
     mean = (confidence[known, None] * change[known]).sum(dim=0) / confidence[known].sum()
     away = torch.cdist(means, means[known]) / (high - low).norm()
-    nearest, rows = away.topk(spreading._NEIGHBORS, largest=False)
-    votes = confidence[known][rows] * torch.exp(-0.5 * (nearest / nearest[:, spreading._NEIGHBORS // 2, None]).square())
+    nearest, rows = away.topk(painting._NEIGHBORS, largest=False)
+    votes = confidence[known][rows] * torch.exp(-0.5 * (nearest / nearest[:, painting._NEIGHBORS // 2, None]).square())
     local = (votes[:, :, None] * (change[known] - mean)[rows]).sum(dim=1) / votes.sum(dim=1, keepdim=True)
-    return mean + torch.exp(-(nearest[:, spreading._NEAR - 1, None] / spreading._FADE).square()) * local
+    return mean + torch.exp(-(nearest[:, painting._NEAR - 1, None] / painting._FADE).square()) * local
 
 
 def test_neighbors_are_those_of_a_plain_search(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,9 +134,9 @@ def test_neighbors_are_those_of_a_plain_search(monkeypatch: pytest.MonkeyPatch) 
     change = torch.sin(5 * means)
     confidence = torch.rand(3000, generator=generator, dtype=torch.float64) * (means[:, 0] < 0.6)
     wanted, gray = neighbors_of_gray(means, confidence, change), torch.full_like(means, 0.5)
-    monkeypatch.setattr(spreading, "_MOST", 2000)  # fewer than there are Gaussians, which then share cells
+    monkeypatch.setattr(painting, "_MOST", 2000)  # fewer than there are Gaussians, which then share cells
     shared = Spreading(means, gray, confidence)(change)
     assert (shared - wanted).abs().mean() < 0.2 * (wanted - wanted.mean(dim=0)).abs().mean()
-    monkeypatch.setattr(spreading, "_MOST", 3000)
-    monkeypatch.setattr(spreading, "_APPROXIMATION", 0.0)
+    monkeypatch.setattr(painting, "_MOST", 3000)
+    monkeypatch.setattr(painting, "_APPROXIMATION", 0.0)
     assert (Spreading(means, gray, confidence)(change) - wanted).abs().max() < 1e-3
