@@ -24,7 +24,6 @@ from torch import Tensor
 
 from benchmarks.common import free_address
 from benchmarks.gpu.part import QUICK, Findings, Sizes, device, network_weights
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.bench.device_checks import (
     BACKGROUND,
     Check,
@@ -44,6 +43,7 @@ from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests import triton_interpreter
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from worker.ranks.process_group import ProcessGroupCollectives
 
 #: Number of freed blocks of memory that hold NaN, by size in bytes.

@@ -19,7 +19,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import sos_reference
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import NEAR
 from sgsst_core.features.layers import winograd_pays_off
 from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeights, load_network_weights
@@ -36,6 +35,7 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.job import JobInputs
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 
 Group = Literal[
     "Gaussians", "views", "style and content", "stiff optimization", "precision", "jobs", "files and orbits"

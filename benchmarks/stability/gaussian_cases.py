@@ -22,7 +22,6 @@ from benchmarks.stability.case import (
     repeated,
     without,
 )
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import ALPHA_MIN, NEAR, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.scene_file import read_scene, write_scene
@@ -30,6 +29,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cpu import project
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors, view_directions
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 
 _IMAGE = "image, coverage, gradient against float64"
 _PROPERTIES = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import sos_reference
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import MaskError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
@@ -45,6 +44,7 @@ from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkp
 from sgsst_core.stylizing.job import JobInputs, check_style_size, prepare_job, prepared_style, rotated
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import LFS_POINTER, ball, cameras, style, wall, write_files
 

@@ -25,10 +25,10 @@ from benchmarks.stability import (
 )
 from benchmarks.stability.case import FLOAT32, PRECISIONS, camera, small_network, texture
 from benchmarks.stability.figure import compute_images, write_figure
-from benchmarks.stability.splat_reference import splat
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.rasterizer.cpu import project
+from tests.sgsst_core.rasterizer.splat_reference import splat
 from tests.stability.hard_cases import check, parameters
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")

@@ -12,7 +12,6 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from benchmarks.methods import VggLpips
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import load_perceptual
@@ -34,6 +33,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import JobStyles
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 

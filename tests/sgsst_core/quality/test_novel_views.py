@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import box_average_reference, features_reference
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, COLOR_OFFSET, SH_C0
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
 from sgsst_core.loss.sos import SosLoss
@@ -36,6 +35,7 @@ from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Style
 from tests.sgsst_core.objects import joined, ring
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.splat_scenes import displaced
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 

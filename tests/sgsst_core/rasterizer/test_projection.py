@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.stability.splat_reference import splat
 from sgsst_core.constants import EPS2D
 from sgsst_core.rasterizer.cpu import (
     Column,
@@ -18,6 +17,7 @@ from sgsst_core.rasterizer.cpu import (
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
+from tests.sgsst_core.rasterizer.splat_reference import splat
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose, single, together
 
 _HALF_LOG2_E = 0.5 * math.log2(math.e)

@@ -13,7 +13,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.stability.splat_reference import ReferenceRasterizer, splat
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.camera_files import read_cameras
@@ -30,6 +29,7 @@ from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from tests.sgsst_core.rasterizer import references as independent
 from tests.sgsst_core.rasterizer.references import assert_background, assert_close_outside_band, relative_error
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer, splat
 from tests.sgsst_core.splat_scenes import (
     camera,
     cloud,

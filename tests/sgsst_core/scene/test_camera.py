@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.camera_files import _colmap_lens
 from sgsst_core.files.camera_folder import ColmapCamera
@@ -44,6 +43,7 @@ from sgsst_core.scene.camera import (
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.objects import ball, ring, scene_of
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 
 
 def camera(width: int = 990, height: int = 742, name: str = "a") -> Camera:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.sos_reference import sos_reference
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.judge import saturated
@@ -21,6 +20,7 @@ from sgsst_core.stylizing.color_transfer import luminance_start
 from sgsst_core.stylizing.job import prepared_style
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import ADAM_EPS, LARGEST_GRADIENT, ColorOptimizer, Stylizer
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, style, wall
 

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core import refine as module
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel import Collectives
@@ -46,6 +45,7 @@ from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.refining import disagreement, refine, render
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights as make_tiny_weights
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.splat_scenes import camera, cloud, single
 from tests.small_scenes import cameras, style, wall
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.budget import Cache
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
@@ -28,6 +27,7 @@ from sgsst_core.stylizing.planner import Rates, estimate, plan_job
 from sgsst_core.stylizing.steps import mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import drawn_color, replace_background
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
@@ -30,6 +29,7 @@ from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views, ViewTargets
 from tests.networks import comparing_pixels, tiny_weights
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.stylizing.test_refining import on_a_rank
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, style, wall

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.stability.splat_reference import ReferenceRasterizer
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import (
@@ -44,6 +43,7 @@ from tests.sgsst_core.files.formats.samples import (
     ksplat,
     refused,
 )
+from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 from tests.small_scenes import cameras, wall
 from worker.derived import blend, convert
