@@ -15,14 +15,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
-import numba
-import numpy as np
 import torch
 from torch import Tensor
 
-from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.scene.colors import luminance, on_screen
 from sgsst_core.scene.gaussians import unit_rotations
@@ -33,9 +29,11 @@ from sgsst_core.style import Style, color_moments, mixed_moments, some_pixels, s
 _FLAT = 1e-9
 #: Number of rounds, each with its own axes; enough to reduce the remaining distance to that between samples.
 ROUNDS = 16
-#: Maximum number of colors sampled from each distribution, and number of knots per axis (a power of 2).
+#: Maximum number of colors sampled from each distribution, and number of knots per axis.
 _SAMPLES = 1 << 16
 _KNOTS = 1 << 9
+#: Number of colors that are moved together: their intermediate results stay in the processor's cache.
+_TOGETHER = 1 << 16
 #: Values closer to each other than this count as equal: a flat scene must not be stretched by its rounding errors.
 _APART = 1e-6
 #: Colors are first clamped to this magnitude. Beyond it their order is irrelevant, and rotating them would lose digits.
@@ -178,7 +176,7 @@ def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
     start = colors.clamp(-_FARTHEST, _FARTHEST)
     drawn, counts = _drawn(weights)
     rounds = _rounds(start[drawn], counts, wanted)
-    return _through(start, rounds) if start.is_cuda else _through_compiled(start, rounds)
+    return torch.cat([_through(part, rounds) for part in start.split(_TOGETHER)])
 
 
 def _rounds(source: Tensor, counts: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
@@ -206,24 +204,6 @@ def _through(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Ten
         along = zip((colors @ axes).unbind(1), maps, strict=True)
         colors = torch.stack([_mapped(values, *map_) for values, map_ in along], dim=1) @ axes.T
     return colors
-
-
-def _through_compiled(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
-    """Compute `_through` for many colors on the CPU."""
-    knots = torch.full((len(rounds), 3, _KNOTS), math.inf, dtype=torch.float64)
-    targets = torch.empty_like(knots)
-    for number, (_, maps) in enumerate(rounds):
-        for axis, (positions, become) in enumerate(maps):
-            knots[number, axis, : len(positions)] = positions
-            targets[number, axis] = become[-1]
-            targets[number, axis, : len(become)] = become
-    slopes = torch.zeros_like(knots)  # computed here, because Numba takes long to compile this line
-    slopes[..., :-1] = targets.diff() / knots.diff()
-    axes = torch.stack([axes.contiguous() for axes, _ in rounds])
-    moved = colors.clone(memory_format=torch.contiguous_format)
-    with kernel_threads():
-        _transport(*(part.numpy() for part in (moved, axes, knots, targets, slopes)))
-    return moved
 
 
 def _drawn(weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -280,52 +260,3 @@ def _mapped(values: Tensor, knots: Tensor, targets: Tensor) -> Tensor:
     low, high = knots[index - 1], knots[index]
     fraction = ((values - low) / (high - low)).clamp(0, 1)
     return torch.lerp(targets[index - 1], targets[index], fraction)
-
-
-#: Number of colors that are processed together; they and the maps of a round fit in a core's L1 and L2 caches.
-_TOGETHER = 512
-
-
-@compiled()
-def _map_values(values: Any, positions: Any, knots: Any, targets: Any, slopes: Any) -> None:
-    """Map values [n] in place by a piecewise linear function with knots [k], constant beyond its ends."""
-    # Each step of the binary search runs over all values before the next one starts. Which half a value is in is
-    # unpredictable, so the code contains no branch on it.
-    for i in range(len(values)):
-        values[i] = max(values[i], knots[0])
-        positions[i] = 0
-    half = len(knots) >> 1
-    while half > 0:
-        for i in range(len(values)):
-            positions[i] += half * (knots[positions[i] + half] <= values[i])
-        half >>= 1
-    for i in range(len(values)):
-        index = positions[i]
-        values[i] = targets[index] + slopes[index] * (values[i] - knots[index])
-
-
-@compiled(parallel=True)
-def _transport(colors: Any, axes: Any, knots: Any, targets: Any, slopes: Any) -> None:
-    """Transform colors by all rounds of `transported`, in place, on all CPU cores.
-
-    Args:
-        colors: [n, 3] float64.
-        axes: [r, 3, 3], axes of each round as columns.
-        knots: [r, 3, k] with k a power of 2, ascending: knots of each axis' map. Unused knots are infinite.
-        targets: [r, 3, k], values at the knots; for unused knots, the last value.
-        slopes: [r, 3, k], slopes between each knot and the next one.
-    """
-    parts = (len(colors) + _TOGETHER - 1) // _TOGETHER
-    for part in numba.prange(parts):
-        some = colors[part * _TOGETHER : (part + 1) * _TOGETHER]
-        along, positions = np.empty((3, len(some))), np.empty(len(some), dtype=np.int64)
-        for r in range(len(axes)):
-            turn = axes[r]
-            for a in range(3):
-                values = along[a]
-                for i in range(len(some)):
-                    values[i] = some[i, 0] * turn[0, a] + some[i, 1] * turn[1, a] + some[i, 2] * turn[2, a]
-                _map_values(values, positions, knots[r, a], targets[r, a], slopes[r, a])
-            for i in range(len(some)):
-                for c in range(3):
-                    some[i, c] = along[0, i] * turn[c, 0] + along[1, i] * turn[c, 1] + along[2, i] * turn[c, 2]
