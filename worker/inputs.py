@@ -40,8 +40,7 @@ from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_property, re
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.orbit import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.facts import check_scales
-from sgsst_core.planning.plan import OPTIMIZER_BYTES
+from sgsst_core.planning.plan import OPTIMIZER_BYTES, check_scales
 from sgsst_core.planning.survey import nothing_seen, sees_something
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import Decision

@@ -28,8 +28,7 @@ from sgsst_core.files.scene_file import SceneFile, write_scene
 from sgsst_core.files.stylized_ply import write_colors
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.facts import common_device, rasterizer_problem
-from sgsst_core.planning.plan import LOSS_VIEWS, Plan
+from sgsst_core.planning.plan import LOSS_VIEWS, Plan, common_device, rasterizer_problem
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice
 from sgsst_core.rasterizer import RASTERIZERS

@@ -23,7 +23,7 @@ from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeig
 from sgsst_core.features.vgg import Activations, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.facts import DTYPES
+from sgsst_core.planning.plan import DTYPES
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera

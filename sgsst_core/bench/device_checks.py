@@ -30,8 +30,7 @@ from sgsst_core.features.weight_files import cache_folder, damage_of
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning.facts import describe_machine, gpu_problems
-from sgsst_core.planning.plan import choose_precision
+from sgsst_core.planning.plan import choose_precision, describe_machine, gpu_problems
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer, rasterizer_for
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera, look_at

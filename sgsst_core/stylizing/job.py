@@ -25,8 +25,7 @@ from sgsst_core.loss.terms import StyleTargets, ViewTarget, combined
 from sgsst_core.orbit import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives, Team
 from sgsst_core.parallel.division import Size
-from sgsst_core.planning.facts import PlanningContext, make_network, sharing_memory
-from sgsst_core.planning.plan import Plan, ends_with_transfer
+from sgsst_core.planning.plan import Plan, PlanningContext, ends_with_transfer, make_network, sharing_memory
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer

@@ -30,15 +30,19 @@ from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import has_statistics
 from sgsst_core.orbit import orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.facts import (
+from sgsst_core.planning.plan import (
     Facts,
+    Plan,
     PlanningContext,
     check_scales,
+    choose_precision,
     count_intersections,
     count_weights,
     equip,
+    is_weighted,
+    make_plan,
+    with_groups,
 )
-from sgsst_core.planning.plan import Plan, choose_precision, is_weighted, make_plan, with_groups
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
 from sgsst_core.planning.time_budget import Pace, SecondsLeft, TimeChoice, choosable, choose, ending_seconds
 from sgsst_core.progress import ANOTHER_LOSS, Decision

@@ -23,7 +23,7 @@ from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.facts import PlanningContext, equip
+from sgsst_core.planning.plan import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, psnr, sees_something
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import Rasterizer

@@ -9,7 +9,7 @@ import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning.facts import equip
+from sgsst_core.planning.plan import equip
 from sgsst_core.quality.measure import Difference, Float32Reference, Measurements, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style

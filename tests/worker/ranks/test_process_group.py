@@ -28,7 +28,7 @@ from sgsst_core.files.photos import Photo
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.messages import decode, encode
 from sgsst_core.parallel.collectives import Collectives, ImageExchange, same_on_all
-from sgsst_core.planning.facts import Machine
+from sgsst_core.planning.plan import Machine
 from sgsst_core.progress import Decision, Progress
 from sgsst_core.scene.camera import Camera, Lens
 from sgsst_core.settings import make_settings
