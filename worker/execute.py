@@ -23,10 +23,9 @@ from sgsst_core.quality.measure import CompressionLoss, Measurements, measure_co
 from sgsst_core.report.document import build_report, loss_over_time, plan_json, seconds_json
 from sgsst_core.report.images import write_contact_sheet, write_views
 from sgsst_core.stylizing.checkpoint import Checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.job import estimate
 from sgsst_core.stylizing.loop import Callbacks, Stopped, run
-from sgsst_core.stylizing.planner import estimate
-from sgsst_core.stylizing.steps import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Evaluation, Stylizer, mean_loss, on_scales_of, round_evaluation, show_nothing
 from worker.job import CONTINUABLE, Result
 from worker.options import RunOptions
 from worker.prepare import Job, Previews, Warn

@@ -37,8 +37,7 @@ from sgsst_core.scene.camera import resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, load_plan, save_plan, versions
-from sgsst_core.stylizing.job import JobInputs, StylizationJob
-from sgsst_core.stylizing.planner import choose_within, plan_job
+from sgsst_core.stylizing.job import JobInputs, StylizationJob, choose_within, plan_job
 from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer, render_first_view, transferred_colors
 from worker.inputs import Inputs, fingerprint_of, read_inputs, same_weights, together

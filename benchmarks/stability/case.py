@@ -31,8 +31,7 @@ from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.settings import PlannedPrecision, Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs
-from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.job import JobInputs, plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 
 Group = Literal[

@@ -52,7 +52,7 @@ from sgsst_core.scene import kernels as scene_kernels  # noqa: F401  # see `_con
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import versions
-from sgsst_core.stylizing.planner import estimate
+from sgsst_core.stylizing.job import estimate
 from worker.capture import choose_axes, orbit_request
 from worker.derived import VideoRequest, blend, convert, render_video, write_page, write_poster
 from worker.inputs import Inputs, cropped, errors_of, read_inputs, read_job_capture

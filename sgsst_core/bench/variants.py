@@ -49,9 +49,8 @@ from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, Settings, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.color_transfer import warm_start
-from sgsst_core.stylizing.steps import relative_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.styles import warm_start
+from sgsst_core.stylizing.stylizer import Stylizer, relative_loss
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

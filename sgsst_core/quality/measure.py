@@ -33,8 +33,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import WHOLE_FLOAT32, StyleLossName
 from sgsst_core.stylizing.job import StylizationJob
-from sgsst_core.stylizing.steps import Evaluation, ShowViews, evaluate, show_nothing
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Evaluation, ShowViews, Stylizer, evaluate, show_nothing
 from sgsst_core.stylizing.views import Views, ViewTargets
 
 

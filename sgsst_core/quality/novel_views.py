@@ -31,7 +31,7 @@ from sgsst_core.rasterizer.base import CameraKey, camera_key
 from sgsst_core.regions import RegionMaps
 from sgsst_core.scene.camera import Camera, between, moved, nearest_walk, resized, similarly_rotated, spread
 from sgsst_core.scene.gaussians import Scene, sampled
-from sgsst_core.stylizing.steps import ShowViews, show_nothing
+from sgsst_core.stylizing.stylizer import ShowViews, show_nothing
 from sgsst_core.stylizing.views import ViewColors
 
 #: Maximum number of views whose Gram distance is measured, and of pairs compared per range.

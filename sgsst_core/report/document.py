@@ -20,11 +20,9 @@ from sgsst_core.progress import duration, percent
 from sgsst_core.quality.findings import Finding
 from sgsst_core.scales import ScaleWeights, predicted_fall, ratio, smoothed
 from sgsst_core.stylizing.checkpoint import versions
-from sgsst_core.stylizing.job import StylizationJob
+from sgsst_core.stylizing.job import StylizationJob, estimate
 from sgsst_core.stylizing.loop import Stopped
-from sgsst_core.stylizing.planner import estimate
-from sgsst_core.stylizing.steps import Evaluation, StepRecord, mean_loss, on_scales_of, relative_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Evaluation, StepRecord, Stylizer, mean_loss, on_scales_of, relative_loss
 
 #: Version of report.json, raised whenever a field is removed or changes its meaning.
 REPORT_VERSION = 4

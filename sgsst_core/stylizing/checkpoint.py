@@ -32,12 +32,12 @@ from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.steps import StylizerState
+from sgsst_core.stylizing.stylizer import StylizerState
 
 T = TypeVar("T")
 
 #: Increased whenever the meaning of a stored value changes.
-FORMAT_VERSION = "10"
+FORMAT_VERSION = "11"
 #: Settings that may differ between a checkpoint and the run that resumes from it. They only end the run or select
 #: measurements; the memory limit, which determines the partition, changes only rounding.
 _FREE_SETTINGS = {"within", "fixed", "target_loss", "early_stop", "memory_limit", "measure"}

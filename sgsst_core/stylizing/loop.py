@@ -30,10 +30,9 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.rendering import RenderMode
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.planner import NETWORK_PARTS, Rates, estimate
+from sgsst_core.stylizing.job import NETWORK_PARTS, Rates, estimate
 from sgsst_core.stylizing.progress_bar import JobBar, job_bar
-from sgsst_core.stylizing.steps import Evaluation, mean_loss, round_evaluation, round_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Evaluation, Stylizer, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.views import PhotoLoader
 
 #: Number of latest steps that the remaining time follows from, and number from which on it does.

@@ -44,8 +44,8 @@ from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.style import Style
-from sgsst_core.stylizing.color_transfer import with_moments
 from sgsst_core.stylizing.job import JobInputs, prepared_style
+from sgsst_core.stylizing.styles import with_moments
 
 #: Number of evenly spread views whose gradient is computed; each costs an iteration.
 GRADIENT_VIEWS = 24

@@ -6,15 +6,16 @@ after it has queued the next one, so that the GPU does not wait for the host.
 
 from __future__ import annotations
 
+import hashlib
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 import psutil
-import scipy  # imports its modules at first use
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -26,37 +27,32 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
+from sgsst_core.loss.terms import LossTerms, StyleTargets
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions import Regions
+from sgsst_core.scales import EVEN, ScaleWeights, ratio, smoothed
 from sgsst_core.scene.camera import Camera, checked_cameras
-from sgsst_core.scene.colors import ColorSubspace, on_screen, on_screen_by_luminance, with_chroma_of
+from sgsst_core.scene.colors import ColorSubspace
 from sgsst_core.scene.gaussians import Scene, checked_scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, image_of
-from sgsst_core.stylizing.job import JobInputs, JobStyles, StylizationJob, in_bfloat16, with_second_attempt
-from sgsst_core.stylizing.planner import choose_within, plan_job
-from sgsst_core.stylizing.refining import refine
-from sgsst_core.stylizing.steps import (
-    BEFORE_STEPS,
-    Evaluation,
+from sgsst_core.stylizing.job import (
+    JobInputs,
     Phase,
-    ShowViews,
-    StepRecord,
-    StylizerState,
-    ViewOrder,
-    completed,
-    drawn_scales,
-    evaluate,
-    mean_evaluation,
-    mean_loss,
+    StylizationJob,
+    choose_within,
+    in_bfloat16,
     phase_at,
-    show_nothing,
+    plan_job,
+    with_second_attempt,
 )
-from sgsst_core.stylizing.views import PhotoLoader, drawn_color
+from sgsst_core.stylizing.refining import refine
+from sgsst_core.stylizing.styles import JobStyles, constrained, neighbors_change
+from sgsst_core.stylizing.views import PhotoLoader, ViewTargets, drawn_color
 
 #: Adam's epsilon: practically zero, so that Gaussians of any blend weight move at the learning rate (SGSST).
 ADAM_EPS = 1e-15
@@ -172,35 +168,9 @@ class ColorOptimizer:
         self._second.copy_(second)
 
 
-def constrained(
-    colors: Tensor, chroma_of: Tensor | None, subspace: ColorSubspace | None = None, *, bounded: bool
-) -> Tensor:
-    """Project DC coefficients [n, 3] to their constraints, without accumulating rounding errors in their chroma.
-
-    Args:
-        colors: [n, 3].
-        chroma_of: [n, 3], colors whose chroma is preserved; None if chroma may change.
-        subspace: Color subspace that colors are projected to; they leave it where it leaves the range. None for any
-            color.
-        bounded: Whether colors must be in 0..1.
-    """
-    colors = colors if subspace is None else subspace.projected(colors)
-    if chroma_of is None:
-        return on_screen(colors) if bounded else colors
-    return with_chroma_of(on_screen_by_luminance(colors) if bounded else colors, chroma_of)
-
-
 def is_too_large(largest: float) -> bool:
     """Return whether a gradient with this largest magnitude (possibly NaN) is unusable."""
     return not largest <= LARGEST_GRADIENT
-
-
-#: Number of seen neighbors that determine the color change of an unseen Gaussian.
-NEIGHBORS = 8
-#: Number of unseen Gaussians processed at a time; their neighbors' changes and weights take some tens of megabytes.
-_CHUNK = 1 << 16
-#: Cells along each axis of the grid that orders the searches.
-_CELLS = 128
 
 
 def transferred_colors(job: StylizationJob, colors: Tensor | None = None) -> Tensor:
@@ -252,41 +222,6 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     return colors
 
 
-def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
-    """Return color changes for the Gaussians that no view sees.
-
-    Each takes the mean change of its nearest seen neighbors, weighted by their total blend weights: the change of a
-    hardly visible Gaussian is determined by only a few pixels.
-
-    Args:
-        means: [N, 3].
-        change: [N, 3], change by the optimization; rows of unseen Gaussians are ignored.
-        weights: [N] float64, total blend weights: 0 for the U unseen Gaussians, positive for at least one other.
-
-    Returns:
-        [U, 3] float32.
-    """
-    seen = weights > 0
-    if bool(seen.all()):
-        return torch.zeros((0, 3))
-    count = min(NEIGHBORS, int(seen.sum()))
-    tree = scipy.spatial.cKDTree(means[seen].double().numpy())
-    weights, change, positions = weights[seen], change[seen], means[~seen].double()
-    votes = torch.empty((len(positions), 3))
-    # Ordered by the cells of a coarse grid: consecutive searches then read the same part of the tree.
-    lowest = positions.amin(dim=0)
-    size = (positions.amax(dim=0) - lowest).clamp_min(1e-300)
-    x, y, z = ((positions - lowest) / size * (_CELLS - 1)).long().unbind(1)
-    for part in torch.argsort((x * _CELLS + y) * _CELLS + z, stable=True).split(_CHUNK):
-        _, indices = tree.query(positions[part].numpy(), k=count, workers=torch.get_num_threads())
-        nearest = torch.as_tensor(indices).reshape(-1, count)
-        own = weights[nearest]
-        fraction = own / own.amax(dim=1, keepdim=True)  # so that tiny weights do not underflow
-        sums = (change[nearest].double() * fraction[:, :, None]).sum(dim=1)
-        votes[part] = (sums / fraction.sum(dim=1, keepdim=True)).float()
-    return votes
-
-
 def render_first_view(
     scene: Scene, camera: Camera, style: Style, settings: Settings, regions: Regions | None = None
 ) -> Tensor | None:
@@ -310,6 +245,210 @@ def render_first_view(
     colors, by_luminance = scene.sh_dc.clone(), settings.preserve_colors == "luminance"
     colors[rows] = styles.transferred(colors[rows], weights[rows], rows, preserve_chroma=by_luminance)
     return rasterizer.render(scene_colors(replace(scene, sh_dc=colors), camera), camera)
+
+
+# --- steps and their losses ----------------------------------------------------------------------------------------
+
+#: Parts of a job's time before its first step, as named in `seconds_by_part`: start of the program, inputs, refinement,
+#: survey, the rest of planning, and preparation of the steps.
+BEFORE_STEPS = ("start", "reading", "refining", "survey", "planning", "preparing")
+
+
+class ViewOrder:
+    """Random order of the views of a job, in which every view comes once before any comes again.
+
+    Attributes:
+        left: Remaining views of this round, next one last; part of checkpoints.
+    """
+
+    def __init__(self, covered: Sequence[int], seed: int) -> None:
+        self.generator = torch.Generator().manual_seed(seed)
+        self.left: list[int] = []
+        self._covered = covered
+
+    def next_view(self) -> int:
+        """Remove and return the next view. Rounds are drawn lazily, because checkpoints store the rest of a round."""
+        if not self.left:
+            drawn = torch.randperm(len(self._covered), generator=self.generator)
+            self.left = [self._covered[index] for index in drawn.tolist()]
+        return self.left.pop()
+
+
+def drawn_scales(chosen: Sequence[int], period: int, seed: int, view: int, visit: int) -> list[int]:
+    """Return the scales of a view that a visit of phase 2 evaluates, finest first (`Settings.scale_sampling`).
+
+    The coarsest is always among them. Of each `period` visits that evaluate a scale, one evaluates the next finer one
+    too. The draw depends only on the arguments: there is no random state, and all ranks agree.
+
+    Args:
+        chosen: Scales of the view with a positive weight, finest first.
+        period: Number of visits; 1 for all scales in every visit.
+        visit: Number of earlier visits of the view.
+    """
+    count = 1
+    while count < len(chosen):
+        visit, position = divmod(visit, period)
+        digest = hashlib.blake2b(f"{seed},{view},{count},{visit}".encode(), digest_size=8).digest()
+        if position != int.from_bytes(digest, "big") % period:
+            break
+        count += 1
+    return list(chosen[-count:])
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """Record of one iteration.
+
+    Attributes:
+        step: Step number, counted from 1 over both phases.
+        view: Index of the camera; of the first one if the step has several views.
+        seconds: Wall-clock seconds of all iterations so far, in all sessions of a resumed job.
+        loss: Loss before the step, mean over the step's views and over the scales in `terms`.
+        terms: Loss by scale and term; of scales that the step has not evaluated, an estimate (`completed`).
+        parts: Time in seconds of this step by activity.
+        memory: Physical memory of the process after the step, in bytes.
+        device_memory: Peak GPU memory of tensors so far, in bytes; None on a CPU.
+        evaluated: Scales that the step has evaluated.
+        pixels: Pixels that this rank has passed through the network.
+    """
+
+    step: int
+    stage: str
+    view: int
+    seconds: float
+    loss: float
+    terms: dict[int, LossTerms]
+    parts: dict[str, float]
+    memory: int
+    device_memory: int | None = None
+    evaluated: tuple[int, ...] = ()
+    pixels: int = 0
+
+
+@dataclass
+class StylizerState:
+    """State from which a run resumes with bit-identical results."""
+
+    sh_dc: Tensor  # [N, 3]
+    first_moment: Tensor  # [N, 3]
+    second_moment: Tensor  # [N, 3]
+    step: int
+    seconds: float
+    generator: Tensor  # state of the random generator
+    queue: list[int]  # views left in this round
+    history: list[StepRecord] = field(default_factory=list)
+    seconds_by_part: dict[str, float] = field(default_factory=dict)
+    # memory budget in bytes: it determines partition and cached weights, and thereby rounding
+    memory: int | None = None
+
+
+Evaluation = dict[int, LossTerms]
+#: Callback that receives the number of completed and of all views.
+ShowViews = Callable[[int, int], None]
+
+
+def show_nothing(done: int, total: int) -> None:
+    """Ignore the progress."""
+
+
+def evaluate(
+    targets: ViewTargets,
+    style_targets: Callable[[Camera], StyleTargets],
+    indices: Sequence[int],
+    sh_dc: Tensor,
+    show: ShowViews = show_nothing,
+) -> Evaluation:
+    """Return the mean SOS loss of colors [n, 3] over views, split by scale; `show` is called before each view."""
+    views, loss = targets.views, targets.loss
+    evaluations = []
+    for done, index in enumerate(indices):
+        show(done, len(indices))
+        camera = views.cameras[index]
+        with torch.no_grad():
+            image = views.render(index, views.colors(index, sh_dc))
+        target = targets.target(index, loss.tiling.scales((camera.height, camera.width)))
+        evaluations.append(loss.evaluate(image, style_targets(camera), target, gradient=False).terms)
+    return mean_evaluation(evaluations)
+
+
+def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
+    """Return the mean over views, scale by scale; views without a scale do not count for it."""
+    total: Evaluation = {}
+    counts: Counter[int] = Counter()
+    for evaluation in evaluations:
+        counts.update(evaluation.keys())
+        for scale, part in evaluation.items():
+            total[scale] = total.get(scale, LossTerms()) + part
+    return {scale: terms / counts[scale] for scale, terms in total.items()}
+
+
+def completed(evaluation: Evaluation, scales: Sequence[int], view: int, history: Sequence[StepRecord]) -> Evaluation:
+    """Return the loss of a step on a view, with estimates for the scales that it has not evaluated.
+
+    An estimate is the loss of the coarsest scale times the ratio of both at the latest step that evaluated both: on the
+    same view, or on any if there is none. Before the first of these steps, a scale is missing. Means over rounds are
+    thereby comparable from round to round, whichever scales were drawn.
+
+    Args:
+        evaluation: Loss of the evaluated scales.
+        scales: Scales of the view with a positive weight.
+        history: Records of the earlier steps.
+    """
+    result, coarsest = dict(evaluation), max(evaluation)
+    for scale in set(scales) - evaluation.keys():
+        last = _last_with({scale, coarsest}, history, view) or _last_with({scale, coarsest}, history)
+        if last:
+            factor = ratio(evaluation[coarsest].total, last[coarsest].total) or 0.0
+            result[scale] = last[scale] * factor
+    return dict(sorted(result.items()))
+
+
+def _last_with(scales: set[int], history: Sequence[StepRecord], view: int | None = None) -> Evaluation | None:
+    """Return the loss of the last step that evaluated some scales, on one view or on any."""
+    steps = (record for record in reversed(history) if view in (None, record.view))
+    return next((record.terms for record in steps if scales <= set(record.evaluated)), None)
+
+
+def round_loss(history: Sequence[StepRecord], round_length: int) -> float:
+    """Return the loss of the last round of views: the geometric mean over the last steps of the current phase.
+
+    Single steps see single views, whose losses differ by factors.
+    """
+    return smoothed([record.loss for record in _last_round(history, round_length)], round_length)
+
+
+def round_evaluation(history: Sequence[StepRecord], round_length: int, weights: ScaleWeights = EVEN) -> Evaluation:
+    """Return the loss of the last round of views by scale and term, scaled so that its mean is `round_loss`."""
+    evaluation = mean_evaluation([record.terms for record in _last_round(history, round_length)])
+    mean = mean_loss(evaluation, weights)
+    factor = round_loss(history, round_length) / mean if mean > 0 else 1.0
+    return {scale: terms * factor for scale, terms in evaluation.items()}
+
+
+def _last_round(history: Sequence[StepRecord], round_length: int) -> list[StepRecord]:
+    last = history[-round_length:]
+    return [record for record in last if record.stage == last[-1].stage]
+
+
+def relative_loss(before: Evaluation, after: Evaluation, weights: ScaleWeights = EVEN) -> float | None:
+    """Return the loss after a job relative to that before it, over the scales that were computed.
+
+    It is None if the loss before the job is 0.
+    """
+    return ratio(mean_loss(after, weights), mean_loss(on_scales_of(after, before), weights))
+
+
+def on_scales_of(after: Evaluation, before: Evaluation) -> Evaluation:
+    """Return the part of `before` on the scales of `after`, or all of `before` if they have none in common."""
+    return {scale: before[scale] for scale in after if scale in before} or before
+
+
+def mean_loss(evaluation: Evaluation, weights: ScaleWeights = EVEN) -> float:
+    """Return E_SOS, the weighted mean of the losses of all scales."""
+    return weights.mean({scale: terms.total for scale, terms in evaluation.items()})
+
+
+# --- stylizer ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.steps import drawn_scales, mean_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Stylizer, drawn_scales, mean_loss
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import cameras, style, wall
 

@@ -39,9 +39,8 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PlannedPrecision, Precision, PresetName, Settings, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import save_plan
-from sgsst_core.stylizing.job import JobInputs
+from sgsst_core.stylizing.job import JobInputs, plan_job
 from sgsst_core.stylizing.loop import Callbacks, run
-from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer, neighbors_change
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, style, wall

@@ -25,8 +25,7 @@ from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs
-from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.job import JobInputs, plan_job
 from tests.real_scenes import scene_path
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import ball, blind_camera, cameras, style, wall

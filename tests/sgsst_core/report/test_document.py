@@ -21,8 +21,7 @@ from sgsst_core.report.page import render_page
 from sgsst_core.scales import smoothed
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import Stopped, run
-from sgsst_core.stylizing.steps import Evaluation, StepRecord, mean_loss, round_evaluation, round_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Evaluation, StepRecord, Stylizer, mean_loss, round_evaluation, round_loss
 from tests.sgsst_core.report.test_page import parsed
 from tests.small_scenes import ball, blind_camera, cameras, style
 

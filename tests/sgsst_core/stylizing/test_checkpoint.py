@@ -22,7 +22,7 @@ from sgsst_core.stylizing.checkpoint import (
     save_checkpoint,
     versions,
 )
-from sgsst_core.stylizing.steps import StepRecord, StylizerState
+from sgsst_core.stylizing.stylizer import StepRecord, StylizerState
 from tests.small_scenes import cameras, style, wall
 
 

@@ -22,11 +22,9 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PlannedPrecision, PresetName, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
-from sgsst_core.stylizing.job import JobInputs, prepare_job
+from sgsst_core.stylizing.job import JobInputs, Rates, estimate, plan_job, prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
-from sgsst_core.stylizing.planner import Rates, estimate, plan_job
-from sgsst_core.stylizing.steps import mean_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Stylizer, mean_loss
 from sgsst_core.stylizing.views import drawn_color, replace_background
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall

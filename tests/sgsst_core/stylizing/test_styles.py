@@ -13,14 +13,14 @@ from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.color_transfer import (
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.styles import (
     _drawn,
     luminance_start,
     transported,
     warm_start,
     with_moments,
 )
-from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer, render_first_view
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.sgsst_core.test_regions import halves
