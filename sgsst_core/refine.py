@@ -6,7 +6,7 @@ x_i. K determines r, and the weights follow from
 
     sum_i w_i x_i = 0,    (s / r)^2 + sum_i w_i x_i^2 = s^2,
 
-so the mixture of the children has the parent's mean and variance. The spacing is the one at which the mixture is
+so the mixture of the children has the parent's mean and variance. The Gaussian function ends where the mixture is
 closest to the parent in L2: within 3 % for every K. (K = 2 is not used: with two children, the mixture is closest if
 they are hardly smaller than the parent.) Axes are split independently, so the mixture of all children has the parent's
 mean and covariance.
@@ -47,10 +47,10 @@ MAX_PIECES = 32
 #: K pieces are smaller than the parent by the factor r = _SLOPE K + _START, for which the mixture is within 3 % of the
 #: parent.
 _SLOPE, _START = 0.35, 0.33
-#: Candidate spacings of children, in units of their deviation.
-_DISTANCES = np.linspace(1.0, 2.6, 33)
-#: Number of children whose geometry is computed at a time; takes some tens of megabytes in float64.
-_ROWS = 1 << 18
+#: The weights of K pieces end at _END - _FEWER / K deviations of the Gaussian function; fitted to the best ends.
+_END, _FEWER = 2.85, 4.2
+#: Number of Gaussians that are split at a time; their children take some tens of megabytes in float64.
+_PARENTS = 1 << 10
 #: Limits of log scale and position. Gaussians beyond them are not split, because their children could leave the range
 #: of float32.
 _LARGEST_LOG_SCALE, _SMALLEST_LOG_SCALE = 60.0, -60.0
@@ -144,13 +144,8 @@ def split(scene: Scene, pieces: Tensor) -> Scene:
         raise ValueError("Gaussians of extreme size or position cannot be split")
     first = counts.cumsum(0) - counts
     result = scene.subset(torch.repeat_interleave(counts))
-    ends = counts[parents].cumsum(0)
-    start = 0
-    while start < len(parents):
-        before = int(ends[start - 1]) if start else 0
-        stop = max(int(torch.searchsorted(ends, before + _ROWS, right=True)), start + 1)
-        _place_children(scene, pieces, parents[start:stop], counts, first, result)
-        start = stop
+    for some in parents.split(_PARENTS):
+        _place_children(scene, pieces, some, counts, first, result)
     return result
 
 
@@ -172,51 +167,12 @@ def ratio_of(number: int) -> float:
     return 1.0 if number == 1 else _SLOPE * number + _START
 
 
-@functools.cache
 def split_axis(number: int) -> AxisSplit:
     """Return the division of an axis into `number` pieces, which is 1, or 3 to `MAX_PIECES`."""
-    if number == 1:
-        return AxisSplit(1.0, np.zeros(1), np.ones(1))
-    ratio = ratio_of(number)
-    divisions = [
-        division for distance in _DISTANCES if (division := _split_axis_at(number, ratio, distance / ratio)) is not None
-    ]
-    return min(divisions, key=mixture_error)
-
-
-def mixture_error(division: AxisSplit) -> float:
-    """Return the L2 distance of the children's mixture from the normal density, relative to that density's norm.
-
-    It is computed in closed form.
-    """
-    child, both = 1 / division.ratio**2, 1 + 1 / division.ratio**2
-    apart = division.offsets[:, None] - division.offsets
-    mixed = division.weights @ _normal(apart, 2 * child) @ division.weights
-    crossed = division.weights @ _normal(division.offsets, both)
-    parent = _normal(np.zeros(1), 2.0)[0]
-    return float(np.sqrt(max(mixed - 2 * crossed + parent, 0.0) / parent))
-
-
-def _normal(offsets: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
-    density: NDArray[np.float64] = np.exp(-(offsets**2) / (2 * variance)) / np.sqrt(2 * np.pi * variance)
-    return density
-
-
-def _split_axis_at(number: int, ratio: float, distance: float) -> AxisSplit | None:
-    """Return the division with spacing `distance` that preserves the parent's variance; None if there is none."""
-    offsets = np.linspace(-1.0, 1.0, number) * ((number - 1) / 2 * distance)
-    squares, wanted = offsets**2, 1 - 1 / ratio**2
-    if not squares.min() < wanted < squares.mean():
-        return None
-    low, high = 0.0, 700 / squares.max()  # the variance decreases from that of equal weights
-    for _ in range(100):
-        middle = (low + high) / 2
-        weights = np.exp(-middle * (squares - squares.min()))
-        weights = weights / weights.sum()
-        low, high = (middle, high) if weights @ squares > wanted else (low, middle)
-    if abs(weights @ squares - wanted) > 1e-12:  # the solution was outside the bracket
-        return None
-    return AxisSplit(ratio, offsets, weights)
+    ratio, positions = ratio_of(number), np.linspace(-1.0, 1.0, number) * (_END - _FEWER / number)
+    weights = np.exp(-(positions**2) / 2)
+    weights = weights / weights.sum()
+    return AxisSplit(ratio, positions * np.sqrt((1 - 1 / ratio**2) / (weights @ positions**2)), weights)
 
 
 @functools.cache

@@ -73,11 +73,13 @@ def survey_views(
     rasterizer: Rasterizer,
     collectives: Collectives = ALONE,
     show: ShowPlanning | None = None,
+    visit: Callable[[Camera, Tensor], None] | None = None,
 ) -> Survey:
     """Survey every view once; all ranks get the same result.
 
     Args:
         show: Callback, called before the first view of this rank and after each view.
+        visit: Callback for the camera of each view of this rank that sees anything, and its blend weights [N].
 
     Raises:
         CameraError: If no camera sees a Gaussian.
@@ -94,6 +96,8 @@ def survey_views(
             views[index] = covered_region(coverage), uncovered, seen
             if seen:
                 weights += summed.double()
+                if visit:
+                    visit(cameras[index], summed)
     for others in collectives.all_gather(views):
         views |= others
     pixels = [camera.width * camera.height for camera in cameras]

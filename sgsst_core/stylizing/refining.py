@@ -9,10 +9,9 @@ gradient shows where texture is needed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -24,7 +23,7 @@ from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.plan import PlanningContext, equip
-from sgsst_core.planning.survey import ShowPlanning, progress_of, psnr, sees_something
+from sgsst_core.planning.survey import ShowPlanning, progress_of, psnr, survey_views
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.refine import (
@@ -40,7 +39,7 @@ from sgsst_core.refine import (
     piece_counts,
     split,
 )
-from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.camera import Camera, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.style import Style
@@ -125,9 +124,10 @@ class _Refining:
         count = len(self._scene)
         nothing = Refinement(torch.ones((count, 3), dtype=torch.uint8), 0, count)
         lengths, finest = self._footprints.lengths, finest_size(self._settings)
-        if not covered or not self._collectives.broadcast(lambda: bool((lengths > finest).any())):
+        if not self._collectives.broadcast(lambda: bool((lengths > finest).any())):
             return nothing
-        cancels, magnitude = self._gradient_disagreement(spread_evenly(covered, GRADIENT_VIEWS))
+        views = spread(covered, GRADIENT_VIEWS)
+        cancels, magnitude = self._gradient_disagreement(views)
         sane = can_be_split(self._scene)
         sane = sane if self._frozen is None else sane & ~self._frozen
         allowed = candidates(self._footprints, sane, cancels, magnitude)
@@ -136,10 +136,9 @@ class _Refining:
             lambda: choose_pieces(lengths, allowed, cancels, most, budget, finest)
         )
         chosen = int((piece_counts(pieces) > 1).sum())
-        fitted = spread_evenly(covered, GRADIENT_VIEWS)
         if self._show:
             self._show(Progress(stage="refining"))
-        pieces, change = self._undo_until_images_are_preserved(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))
+        pieces, change = self._undo_until_images_are_preserved(pieces, views, spread(covered, MEASURED_VIEWS))
         counts = piece_counts(pieces)
         parents = int((counts > 1).sum())
         if change is None:
@@ -167,17 +166,16 @@ class _Refining:
 
     def _survey(self) -> list[int]:
         """Survey every view, and return those that see anything."""
-        collectives, cameras = self._collectives, self._planning_context.cameras
-        covered = []
-        for index in self._shown(range(len(cameras)), "planning"):
-            coverage, weights = self._rasterizer.survey(cameras[index])
-            if sees_something(coverage):
-                covered.append(index)
-                self._footprints.add(cameras[index], weights.cpu())
+        collectives, context = self._collectives, self._planning_context
+
+        def visit(camera: Camera, weights: Tensor) -> None:
+            self._footprints.add(camera, weights.cpu())
+
+        survey = survey_views(self._scene, context.cameras, self._rasterizer, collectives, self._show, visit)
         sums, reach = self._footprints.sums
         every = torch.stack(collectives.all_gather(reach)).amax(dim=0) if collectives.size > 1 else reach
         self._footprints.replace(self._sum(sums), every)
-        return sorted(index for views in collectives.all_gather(covered) for index in views)
+        return survey.covered
 
     def _gradient_disagreement(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return the sum over some views of the `disagreement` of the style loss gradient."""
@@ -193,7 +191,9 @@ class _Refining:
         )
         targets: dict[tuple[int, int], StyleTargets] = {}
         sums = torch.zeros((len(scene), 2), dtype=torch.float64)
-        for index in self._shown(views, "refining"):
+        for done, index in enumerate(self._of_this_rank(views)):
+            if self._show:
+                self._show(progress_of(done, len(views), self._collectives.size, "refining"))
             camera = cameras[index]
             size = (camera.height, camera.width)
             if size not in targets:
@@ -260,13 +260,6 @@ class _Refining:
         """Return the views that this rank processes."""
         return views[self._collectives.rank :: self._collectives.size]
 
-    def _shown(self, views: Sequence[int], stage: Literal["planning", "refining"]) -> Iterator[int]:
-        """Yield the views that this rank processes, one by one, and report progress."""
-        for done, index in enumerate(self._of_this_rank(views)):
-            if self._show:
-                self._show(progress_of(done, len(views), self._collectives.size, stage))
-            yield index
-
     def _sum(self, values: Tensor) -> Tensor:
         """Return the sum over all ranks."""
         return self._collectives.all_reduce(values.to(self._rasterizer.device)).cpu()
@@ -288,9 +281,3 @@ def disagreement(rasterizer: Rasterizer, camera: Camera, image_gradient: Tensor)
 def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:
     """Return the image [H, W, 3] of a scene, using a rasterizer with its geometry."""
     return rasterizer.render(scene_colors(scene, camera, rasterizer.device), camera)
-
-
-def spread_evenly(views: Sequence[int], most: int) -> list[int]:
-    """Return at most `most` views, evenly spread and including the first."""
-    count = min(most, len(views))
-    return [views[index * len(views) // count] for index in range(count)]
