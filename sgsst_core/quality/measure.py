@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -301,8 +300,7 @@ class Float32Reference(ExactLoss):
             index, phase = stylizer.history[-1].view, stylizer.phase
         scales = phase.scales(stylizer.job.scales(index))
         colors = stylizer.job.scene.sh_dc if start else stylizer.stylized()
-        with stylizer.with_colors(colors) if start or stylizer.job.transfers_last else nullcontext():
-            approximate, seconds = stylizer.gradient(index, scales)
+        approximate, seconds = stylizer.gradient(index, scales, colors[self.seen])
         exact, seconds_exact = self.gradient(index, colors, scales)
         difference = Difference.of(approximate, exact[self.seen])
         step, view = 0 if start else stylizer.step, stylizer.job.views.cameras[index].name

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -373,13 +372,11 @@ def evaluate(
 
 def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Return the mean over views, scale by scale; views without a scale do not count for it."""
-    total: Evaluation = {}
-    counts: Counter[int] = Counter()
-    for evaluation in evaluations:
-        counts.update(evaluation.keys())
-        for scale, part in evaluation.items():
-            total[scale] = total.get(scale, LossTerms()) + part
-    return {scale: terms / counts[scale] for scale, terms in total.items()}
+    result: Evaluation = {}
+    for scale in dict.fromkeys(scale for evaluation in evaluations for scale in evaluation):
+        parts = [evaluation[scale] for evaluation in evaluations if scale in evaluation]
+        result[scale] = sum(parts, LossTerms()) / len(parts)
+    return result
 
 
 def completed(evaluation: Evaluation, scales: Sequence[int], view: int, history: Sequence[StepRecord]) -> Evaluation:
@@ -783,18 +780,22 @@ class Stylizer:
         job = self.job
         return with_second_attempt(job, lambda: evaluate(job.view_targets, job.style_targets, indices, values, show))
 
-    def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
+    def gradient(self, index: int, scales: Sequence[int], sh_dc: Tensor | None = None) -> tuple[Tensor, float]:
         """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its time in seconds.
 
         Targets are prepared before timing starts. This does not affect steps, and caches no blend weights.
+
+        Args:
+            sh_dc: [n, 3], colors of the rendered Gaussians; None for the present ones.
         """
         self._cache_visited()
+        values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
         target, style = (
             self.job.view_targets.target(index, scales),
             self.job.style_targets(self.job.views.cameras[index]),
         )
         started = time.perf_counter()
-        gradient = self.job.gradient(index, self.sh_dc.detach(), style, target, scales)[0].cpu()
+        gradient = self.job.gradient(index, values, style, target, scales)[0].cpu()
         return gradient, time.perf_counter() - started
 
     def _cache_visited(self) -> None:
@@ -834,24 +835,6 @@ class Stylizer:
         if not self.job.transfers_last:
             return self.sh_dc.detach()
         return self.stylized()[self.job.plan.seen].to(self.sh_dc.device)
-
-    def set_colors(self, sh_dc: Tensor) -> None:
-        """Replace the present colors with sh_dc [N, 3] of the whole scene, for example to evaluate them."""
-        self._stylized = None
-        with torch.no_grad():
-            self.sh_dc.copy_(sh_dc[self.job.plan.seen])
-
-    @contextmanager
-    def with_colors(self, sh_dc: Tensor) -> Iterator[None]:
-        """Use sh_dc [N, 3] of the whole scene inside a `with` block, then restore the present colors exactly."""
-        present, stylized = self.sh_dc.detach().clone(), self._stylized
-        self.set_colors(sh_dc)
-        try:
-            yield
-        finally:
-            self._stylized = stylized
-            with torch.no_grad():
-                self.sh_dc.copy_(present)
 
     def state(self) -> StylizerState:
         """Return a copy of everything that a resumed run needs."""
