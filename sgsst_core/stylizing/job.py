@@ -15,13 +15,13 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import Cache, forget_device_peak, memory_for
+from sgsst_core.budget import forget_device_peak, memory_for
 from sgsst_core.devices import Timer, wait_for
 from sgsst_core.errors import CameraError, DeviceMemoryError, OutputError
 from sgsst_core.features.network_weights import BackboneWeights
@@ -227,11 +227,6 @@ class StylizationJob:
     def preserves_chroma(self) -> bool:
         """Whether only luminance changes."""
         return self.settings.preserve_colors == "luminance"
-
-    @property
-    def caches(self) -> dict[str, Cache[Any, Any]]:
-        """Caches of data of the views by name, "weights" before "intersections"."""
-        return {**self.views.caches, **self.view_targets.caches}
 
     def gradient(
         self,
@@ -478,7 +473,7 @@ def prepare_job(
         timer=loss.timer,
     )
     if plan.spare:
-        views.caches["intersections"].limit(memory_for("rasterizer", memory) + plan.spare // 2)
+        rasterizer.caches["intersections"].limit(memory_for("rasterizer", memory) + plan.spare // 2)
     repeatable = rasterizer.repeatable
     view_targets = ViewTargets(
         views,

@@ -336,11 +336,7 @@ class JobStyles:
     @property
     def all(self) -> list[Style]:
         """All distinct styles in use."""
-        styles: list[Style] = []
-        for style in self.each or (self.own,):
-            if all(style is not other for other in styles):
-                styles.append(style)
-        return styles
+        return [*{id(style): style for style in self.each or (self.own,)}.values()]
 
     def to(self, device: torch.device) -> JobStyles:
         """Return the styles with their images on a device."""
