@@ -281,17 +281,8 @@ def common_device(collectives: Collectives) -> Device:
 
 
 def gpu_problems(collectives: Collectives) -> dict[str, str]:
-    """Return the problem of each GPU rasterizer that does not work on some rank, by the rasterizer's name.
-
-    Rasterizers are tried in order of preference, until one works.
-    """
-    problems: dict[str, str] = {}
-    for name in gpu_rasterizers():
-        problem = rasterizer_problem(collectives, name)
-        if problem is None:
-            break
-        problems[name] = problem
-    return problems
+    """Return the problem of each GPU rasterizer that does not work on some rank, by the rasterizer's name."""
+    return {name: problem for name in gpu_rasterizers() if (problem := rasterizer_problem(collectives, name))}
 
 
 def rasterizer_problem(collectives: Collectives, name: str) -> str | None:
@@ -649,10 +640,8 @@ def _blend_weights(plan: Plan, facts: Facts, settings: Settings) -> tuple[Cached
     budget, cached = memory_for("rasterizer", facts.machine.memory), settings.cached_weights
     if cached == "auto":
         cached = "float32" if whole <= budget or settings.preset == "paper" else "half"
-    name, size, error = "float32", whole, "none"
-    if cached == "half":
-        name, size = "half precision", halved
-        error = "each weight is off by at most 1/2048 of its value: 0.12 of 255 levels per pixel"
+    half = "half precision", halved, "each weight is off by at most 1/2048 of its value: 0.12 of 255 levels per pixel"
+    name, size, error = half if cached == "half" else ("float32", whole, "none")
     of_a_view = size / len(plan.covered)
     portion = "all" if size <= budget else f"{budget // of_a_view * of_a_view / size:.0%} of the views'"
     reason = f"they take {size / 1e9:.2f} GB for all views; {budget / 1e9:.1f} GB are available for blend weights"

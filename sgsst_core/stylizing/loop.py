@@ -31,7 +31,7 @@ from sgsst_core.scene.rendering import RenderMode
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import NETWORK_PARTS, Rates, estimate
-from sgsst_core.stylizing.progress_bar import JobBar, job_bar
+from sgsst_core.stylizing.progress_bar import job_bar
 from sgsst_core.stylizing.stylizer import Evaluation, Stylizer, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.views import PhotoLoader
 
@@ -354,23 +354,17 @@ def stylize(
         job = stylizer.job
         if isinstance(scene, SceneFile):
             scene.refined(job.plan.refinement)  # raises before the steps if the file cannot hold the result
-        callbacks = callbacks or Callbacks()
-        run(stylizer, _shown(bar, replace(callbacks, left=callbacks.left or left)))
+        own = callbacks or Callbacks()
+
+        def report(now: Progress) -> None:
+            if show:
+                show(now)
+            if own.progress:
+                own.progress(now)
+
+        run(stylizer, replace(own, progress=report, left=own.left or left))
     result = replace(job.scene, sh_dc=stylizer.stylized())
     return cast(F, stylized(scene, result, job.plan.refinement, chosen.sh_attenuation))
-
-
-def _shown(bar: JobBar | None, callbacks: Callbacks) -> Callbacks:
-    """Return callbacks that update a progress bar, if there is one, and call the given ones."""
-    if bar is None:
-        return callbacks
-
-    def show(progress: Progress) -> None:
-        bar.show(progress)
-        if callbacks.progress:
-            callbacks.progress(progress)
-
-    return replace(callbacks, progress=show)
 
 
 Stopped = Literal["finished", "within", "target-loss", "converged", "on-request", "interrupted"]

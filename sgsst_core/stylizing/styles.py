@@ -43,7 +43,7 @@ from sgsst_core.scene.colors import (
 )
 from sgsst_core.scene.gaussians import unit_rotations
 from sgsst_core.settings import MAX_RESOLUTION, Settings
-from sgsst_core.style import Style, color_moments, mixed_moments, some_pixels, square_root, style_moments
+from sgsst_core.style import Moments, Style, color_moments, mixed_moments, some_pixels, square_root, style_moments
 
 #: A direction counts as flat if the variance of the colors along it is less than this fraction of their largest
 #: variance. It is not stretched to the style's spread, which would amplify rounding errors.
@@ -119,7 +119,7 @@ def luminance_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
     """
     colors = COLOR_OFFSET + SH_C0 * sh_dc.double()
     own, shown = luminance(colors), luminance(colors.clamp(0, 1))
-    matched = _matched(shown, _luminance_moments(shown, weights.double()), _style_luminance(style))
+    matched = _matched(shown, color_moments(shown[:, None], weights), _style_luminance(style))
     return (sh_dc.double() + ((matched - own) / SH_C0)[:, None]).to(sh_dc.dtype)
 
 
@@ -128,8 +128,8 @@ def in_luminance_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
 
     Several images are mapped together, by the moments of their mixture. Arguments are as in `warm_start`.
     """
-    wanted = _luminance_moments(luminance((COLOR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)), weights.double())
-    own = _style_luminance(style)
+    colors = (COLOR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)
+    own, wanted = _style_luminance(style), color_moments(luminance(colors)[:, None], weights)
 
     def match(image: Tensor) -> Tensor:
         matched = _matched(luminance(image.double()), own, wanted)
@@ -138,30 +138,17 @@ def in_luminance_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
     return style.map(match)
 
 
-def _style_luminance(style: Style) -> tuple[Tensor, Tensor]:
-    """Return mean and deviation of the luminance of a style's pixels."""
+def _style_luminance(style: Style) -> Moments:
+    """Return mean [1] and variance [1, 1] of the luminance of a style's pixels."""
     luminances = [luminance(image.reshape(-1, 3).double()) for image in style.images]
-    parts = [_luminance_moments(values, torch.ones_like(values)) for values in luminances]
-    if len(parts) == 1:
-        return parts[0]
-    moments = [(mean[None], spread.square()[None, None]) for mean, spread in parts]
-    mean, variance = mixed_moments(moments, style.weights)
-    return mean[0], variance[0, 0].sqrt()
+    return mixed_moments([color_moments(values[:, None]) for values in luminances], style.weights)
 
 
-def _luminance_moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weighted mean and deviation of values [n]."""
-    fraction = weights / weights.amax()
-    fraction = fraction / fraction.sum()
-    mean = (fraction * values).sum()
-    return mean, (fraction * (values - mean).square()).sum().sqrt()
-
-
-def _matched(values: Tensor, own: tuple[Tensor, Tensor], wanted: tuple[Tensor, Tensor]) -> Tensor:
-    """Map values linearly to another mean and deviation, clamped to 0..1; flat values are only shifted."""
-    (mean, deviation), (wanted_mean, wanted_deviation) = own, (part.to(values) for part in wanted)
-    flat = deviation <= _FLAT**0.5 * mean.abs().clamp_min(torch.finfo(values.dtype).tiny)
-    factor = torch.where(flat, 0.0, wanted_deviation / torch.where(flat, 1.0, deviation))
+def _matched(values: Tensor, own: Moments, wanted: Moments) -> Tensor:
+    """Map values linearly to another mean and variance, clamped to 0..1; flat values are only shifted."""
+    (mean, variance), (wanted_mean, wanted_variance) = own, (part.to(values) for part in wanted)
+    flat = variance[0, 0] <= _FLAT * mean.square().clamp_min(torch.finfo(values.dtype).tiny)
+    factor = torch.where(flat, 0.0, wanted_variance[0, 0] / torch.where(flat, 1.0, variance[0, 0])).sqrt()
     return ((values - mean) * factor + wanted_mean).clamp(0, 1)
 
 
