@@ -16,7 +16,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import ContentFeatures, ViewTarget
-from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, ShownGaussians
+from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange
 from sgsst_core.parallel.division import Divider, Division, Piece, ScaledView, Shares, ViewImages
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions import ContentMaps, RegionMaps
@@ -89,9 +89,7 @@ class Views:
         self._divider = divider
         self._regions = regions
         self._shares: dict[int, Shares] = {}
-        shown = memory // 16 if self.collectives.size > 1 else 0
-        self._shown: Cache[int, ShownGaussians] = Cache(shown)
-        self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4 - shown)
+        self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4)
         self._sh_dc = scene.sh_dc.to(rasterizer.device)
 
     def __len__(self) -> int:
@@ -149,7 +147,6 @@ class Views:
     def forget_shares(self) -> None:
         """Clear what depends on the rectangles that the ranks render, because they are about to change."""
         self._shares.clear()
-        self._shown.clear()
         self.rasterizer.forget_views()
 
     def gradient(self, index: int, image_gradient: Tensor, colors: Tensor) -> Tensor:
@@ -164,7 +161,8 @@ class Views:
             gradient = self._nothing(len(colors), 3)
         else:
             gradient = self.rasterizer.color_gradient(image_gradient, camera)
-        gradient = self._sum(gradient, self._shown_by(index))
+        with self.timer("communication"):
+            gradient = self.collectives.all_reduce(gradient)
         # After the sum, because which colors pass the clamp depends on the sign of their total gradient.
         return view_colors_gradient(gradient, colors, clamp_aware_gradient=self.clamp_aware_gradient)
 
@@ -176,39 +174,6 @@ class Views:
         camera = self._own_camera(index)
         if camera is not None:
             self.rasterizer.cache_weights(camera)
-
-    def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
-        """Return the sum [N, 3] of all ranks' gradients, which are 0 for all Gaussians but those in `shown`."""
-        with self.timer("communication"):
-            if shown is None or not shown.sparse:
-                return self.collectives.all_reduce(gradient)
-            indices = shown.indices()
-            return gradient.index_copy_(0, indices, self.collectives.all_reduce(gradient.index_select(0, indices)))
-
-    def _shown_by(self, index: int) -> ShownGaussians | None:
-        """Return the Gaussians that any rank's rectangle of a view shows.
-
-        Ranks agree on them at the first visit, using the same blend weights as gradients do. Blend weights of another
-        rasterizer, or of the whole view instead of its rectangles, may differ by rounding at the smallest opacity.
-
-        Returns:
-            The Gaussians; None if there is only one rank, or if they do not fit in the cache.
-        """
-        size = ShownGaussians.nbytes(len(self.scene))
-        if self.collectives.size == 1 or (index not in self._shown and not self._shown.has_space(size)):
-            return None
-
-        def find() -> ShownGaussians:
-            mask = torch.zeros(len(self.scene), dtype=torch.bool, device=self.rasterizer.device)
-            with self.timer("prepare"):
-                camera = self._own_camera(index)
-                if camera is not None:  # weights are never negative, so their sum is 0 only if all are
-                    ones = torch.ones((camera.height, camera.width, 3))
-                    mask = self.rasterizer.color_gradient(ones, camera)[:, 0] > 0
-            with self.timer("communication"):
-                return ShownGaussians(self.collectives.union(mask))
-
-        return self._shown.get(index, find, size)
 
     def _nothing(self, *shape: int) -> Tensor:
         """Return zeros: the contribution of a rank that has no pixels of a view."""

@@ -276,17 +276,10 @@ class ProcessGroupCollectives(Collectives):
 
     def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
         """See `Collectives`."""
-        return self._reduce(tensor, traffic)
-
-    def union(self, mask: Tensor) -> Tensor:
-        """See `Collectives`."""
-        return self._reduce(mask.to(torch.uint8), "gradient", dist.ReduceOp.MAX).bool()
-
-    def _reduce(self, tensor: Tensor, traffic: Traffic, operation: Any = dist.ReduceOp.SUM) -> Tensor:
         tensor = tensor.contiguous()
         self.sent[traffic] += 2 * (self.size - 1) * tensor.nbytes // self.size
         with WAITING:
-            dist.all_reduce(tensor, operation, group=self._group)
+            dist.all_reduce(tensor, group=self._group)
         return tensor
 
     def all_reduce_statistics(
