@@ -24,14 +24,13 @@ from sgsst_core.files.library import F, as_scene, stylized
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.planning.time_budget import SecondsLeft, ending_seconds
-from sgsst_core.progress import Progress
+from sgsst_core.progress import Progress, job_bar
 from sgsst_core.scales import has_converged, has_reached, window_length
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.rendering import RenderMode
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import NETWORK_PARTS, Rates, estimate
-from sgsst_core.stylizing.progress_bar import job_bar
 from sgsst_core.stylizing.stylizer import Evaluation, Stylizer, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.views import PhotoLoader
 
