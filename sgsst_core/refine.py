@@ -58,21 +58,6 @@ _FARTHEST = 1e30
 
 
 @dataclass(frozen=True)
-class AxisSplit:
-    """Division of one axis into pieces, for a parent with deviation 1.
-
-    Attributes:
-        ratio: Factor by which children are smaller.
-        offsets: [K] float64, positions of the children, ascending and symmetric about 0.
-        weights: [K] float64 with sum 1.
-    """
-
-    ratio: float
-    offsets: NDArray[np.float64]
-    weights: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
 class Refinement:
     """Record of how a scene was refined, for display and to repeat the refinement.
 
@@ -167,12 +152,16 @@ def ratio_of(number: int) -> float:
     return 1.0 if number == 1 else _SLOPE * number + _START
 
 
-def split_axis(number: int) -> AxisSplit:
-    """Return the division of an axis into `number` pieces, which is 1, or 3 to `MAX_PIECES`."""
+def split_axis(number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Divide an axis of a parent with deviation 1 into `number` pieces, which is 1, or 3 to `MAX_PIECES`.
+
+    Returns:
+        Positions of the children [K] float64, ascending and symmetric about 0, and their weights [K] with sum 1.
+    """
     ratio, positions = ratio_of(number), np.linspace(-1.0, 1.0, number) * (_END - _FEWER / number)
     weights = np.exp(-(positions**2) / 2)
     weights = weights / weights.sum()
-    return AxisSplit(ratio, positions * np.sqrt((1 - 1 / ratio**2) / (weights @ positions**2)), weights)
+    return positions * np.sqrt((1 - 1 / ratio**2) / (weights @ positions**2)), weights
 
 
 @functools.cache
@@ -181,10 +170,10 @@ def _tables() -> tuple[Tensor, Tensor, Tensor]:
     offsets, log_weights = torch.zeros(2, MAX_PIECES + 1, MAX_PIECES, dtype=torch.float64)
     ratios = torch.zeros(MAX_PIECES + 1, dtype=torch.float64)
     for number in (1, *range(3, MAX_PIECES + 1)):
-        division = split_axis(number)
-        offsets[number, :number] = torch.from_numpy(division.offsets)
-        log_weights[number, :number] = torch.from_numpy(np.log(division.weights * division.ratio))
-        ratios[number] = np.log(division.ratio)
+        positions, weights = split_axis(number)
+        offsets[number, :number] = torch.from_numpy(positions)
+        log_weights[number, :number] = torch.from_numpy(np.log(weights * ratio_of(number)))
+        ratios[number] = np.log(ratio_of(number))
     return offsets, log_weights, ratios
 
 

@@ -246,7 +246,9 @@ def _write_reports(
         if job.request.colors and _has_rows_of_file(job) and not attenuated:  # only f_dc changes
             write_colors(outputs.colors, stylizer.stylized())
         near, survey = stylizer.job.settings.near, stylizer.job.plan.survey
-        findings = findings_of(job.scene_file, stylizer.job.views.cameras, stylizer.job.style, near=near, survey=survey)
+        findings = findings_of(
+            job.scene_file, stylizer.job.views.cameras, stylizer.job.styles.own, near=near, survey=survey
+        )
         _count_remaining(job, "writing")
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
         report |= seconds_json(stylizer, job.seconds)

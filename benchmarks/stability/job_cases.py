@@ -295,7 +295,7 @@ def _evaluated(
             style_scale=settings.style_scale,
             scales=job.job.loss.weights,
         )
-        return evaluate(loss, image, job.job.style, content, coverage)
+        return evaluate(loss, image, job.job.styles.own, content, coverage)
 
     return evaluated
 

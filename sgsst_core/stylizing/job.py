@@ -130,15 +130,6 @@ class Phase:
         return list(chosen) if self.scale is None else [chosen[max(len(chosen) - 1 - self.scale, 0)]]
 
 
-def phase_at(schedule: Sequence[Phase], step: int) -> Phase:
-    """Return the phase of the step after `step` completed steps; the last phase if all steps are done."""
-    for phase in schedule:
-        if step < phase.steps:
-            return phase
-        step -= phase.steps
-    return schedule[-1]
-
-
 @dataclass(frozen=True)
 class StylizationJob:
     """Context of a stylization, which steps only read; `prepare_job` creates it.
@@ -171,29 +162,9 @@ class StylizationJob:
     survey_seconds: float = 0.0
 
     @property
-    def style(self) -> Style:
-        """Style of all Gaussians that are not in a region with its own style."""
-        return self.styles.own
-
-    @property
-    def regions(self) -> Regions | None:
-        """Regions with their own style, or frozen; None for one style everywhere."""
-        return self.styles.regions
-
-    @property
     def collectives(self) -> Collectives:
         """All ranks that take part."""
         return self.team.everybody
-
-    @property
-    def group(self) -> Collectives:
-        """Ranks that process the same views as this one."""
-        return self.team.group
-
-    @property
-    def timer(self) -> Timer:
-        """Timer of the activities of a step."""
-        return self.loss.timer
 
     @property
     def schedule(self) -> list[Phase]:
@@ -244,15 +215,15 @@ class StylizationJob:
             scales: Scales to evaluate; a mapping gives their weights (`SosLoss.evaluate`).
             background: Background color; None for that of the settings.
         """
-        with self.timer("render"), torch.no_grad():
+        with self.loss.timer("render"), torch.no_grad():
             colors = self.views.colors(index, sh_dc)
             image = self.views.render(index, colors)
             if background is not None:
                 image = self.view_targets.replace_background(index, image, background)
-        with self.timer("loss"):
+        with self.loss.timer("loss"):
             evaluate = self.graphs.evaluate if self.graphs is not None else self.loss.evaluate
             result = evaluate(image, style, target, scales)
-        with self.timer("raster_backward"):
+        with self.loss.timer("raster_backward"):
             assert result.image_gradient is not None
             return self.views.gradient(index, result.image_gradient.to(colors.device), colors), result
 
@@ -295,7 +266,6 @@ def plan_job(
     """
     _check_cameras(inputs)
     timer, chosen, context = timer or Timer(), inputs.chosen, None
-    survey_seconds = 0.0
     settings = chosen.applied(inputs.settings) if chosen else inputs.settings
     if plan is None:
         with timer("planning"):
@@ -304,10 +274,8 @@ def plan_job(
             weights = weights_for(inputs.weights, settings)
             context = equip(inputs.scene, fitted, settings, weights, collectives, inputs.rasterizer)
             if survey is None:
-                started = time.perf_counter()
                 with timer("survey"):
                     survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
-                survey_seconds = (time.perf_counter() - started) * collectives.size / len(fitted)
             about = [*_about_inputs(inputs, settings, survey, fitted)]
             facts = collectives.broadcast(lambda: _facts(context, survey, inputs.regions))
             plan = make_plan(facts, settings, groups=groups, measured=inputs.measured, about=about)
@@ -317,7 +285,8 @@ def plan_job(
     with timer("preparing"):
         inputs = replace(inputs, settings=with_groups(settings, plan.groups))
         job = prepare_job(plan, inputs, collectives=collectives, planning_context=context)
-    return replace(job, survey_seconds=survey_seconds)
+    surveyed = timer.seconds.get("survey", 0.0) * collectives.size
+    return replace(job, survey_seconds=surveyed / len(inputs.cameras))
 
 
 def _check_cameras(inputs: JobInputs) -> None:

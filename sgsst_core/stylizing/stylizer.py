@@ -45,7 +45,6 @@ from sgsst_core.stylizing.job import (
     StylizationJob,
     choose_within,
     in_bfloat16,
-    phase_at,
     plan_job,
     with_second_attempt,
 )
@@ -211,7 +210,7 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     if job.settings.unseen != "neighbors":
         return colors
     weights = torch.where(job.plan.optimized, job.plan.survey.total_blend_weights, 0.0)
-    free = torch.ones_like(job.plan.seen) if job.regions is None else ~job.regions.frozen
+    free = torch.ones_like(job.plan.seen) if job.styles.regions is None else ~job.styles.regions.frozen
     unseen = (weights <= 0) & free
     change = neighbors_change(job.scene.means[free], (colors - job.scene.sh_dc)[free], weights[free])
     change = change.mean(dim=1, keepdim=True) if job.preserves_chroma else change
@@ -502,7 +501,7 @@ class Stylizer:
         warm = job.plan.warm_start
         start = job.collectives.broadcast(lambda: transferred_colors(job)) if warm else views.scene.sh_dc
         self.sh_dc = start.clone().to(device)
-        frozen = job.regions.frozen[seen] if job.regions else torch.zeros(0, dtype=torch.bool)
+        frozen = job.styles.regions.frozen[seen] if job.styles.regions else torch.zeros(0, dtype=torch.bool)
         #: Mask [n, 1] of frozen Gaussians; None if there are none.
         self._frozen = frozen.to(device)[:, None] if frozen.any() else None
         subspace = job.collectives.broadcast(lambda: job.styles.color_subspace(settings))
@@ -570,7 +569,8 @@ class Stylizer:
     @property
     def phase(self) -> Phase:
         """Phase of the next step; the last phase if all steps are done."""
-        return phase_at(self.job.schedule, self.step)
+        coarse, sos = self.job.schedule
+        return coarse if self.step < coarse.steps else sos
 
     def start(self, show: ShowViews = show_nothing) -> Evaluation:
         """Return the loss of the unstylized scene on the evaluation views; evaluated once, at the first call."""
@@ -588,7 +588,9 @@ class Stylizer:
 
     def drawn_background(self, index: int) -> Color | None:
         """Return the background color of a view in the next step; None for the background of the settings."""
-        return drawn_color(self.job.plan.training_background, self.job.settings.seed, self.step, index, self.job.style)
+        return drawn_color(
+            self.job.plan.training_background, self.job.settings.seed, self.step, index, self.job.styles.own
+        )
 
     @property
     def reads_late(self) -> bool:
@@ -617,7 +619,7 @@ class Stylizer:
         """
         started = time.perf_counter()
         self._stylized = None
-        self.job.timer.clear()
+        self.job.loss.timer.clear()
         self._cache_visited()
         phase = self.phase
         self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
@@ -666,18 +668,18 @@ class Stylizer:
     def _queue(self, views: list[int], phase: Phase) -> None:
         """Queue a step."""
         gradient, results, pixels = with_second_attempt(self.job, lambda: self._mean_gradient(views, phase))
-        with self.job.timer("optimizer"):
+        with self.job.loss.timer("optimizer"):
             done = self.step / max(self.job.total_steps - 1, 1)
             # In float32, so that the rate does not depend on the number of steps by rounding (`Settings.with_steps`).
             rate = self.job.settings.learning_rate
             if self.job.settings.learning_rate_end != rate:
                 rate = float(np.float32(self.job.settings.learning_rate_at(done)))
             largest = self._optimizer.update(gradient, rate)
-        with self.job.timer("communication"):
+        with self.job.loss.timer("communication"):
             self.job.team.check_drift(self.step + 1, self.sh_dc)
         values, copied = self._copied(largest, results)
         results = [replace(result, image_gradient=None) for result in results]  # frees the gradients
-        timer = self.job.timer.lap()
+        timer = self.job.loss.timer.lap()
         self._queued = _QueuedStep(self.step + 1, phase, views, results, pixels, values, copied, timer)
 
     def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, list[SosResult], int]:
@@ -692,20 +694,20 @@ class Stylizer:
         for index in own_views:
             scales = self._scales(index, phase, self.step, views[0])
             background = self.drawn_background(index)
-            with self.job.timer("prepare", whole=True):
+            with self.job.loss.timer("prepare", whole=True):
                 self.job.views.cache_weights(index)
                 target = self.job.view_targets.target(index, list(scales), background)
                 style = self.job.style_targets(self.job.views.cameras[index])
             assert target.division is not None
-            cost += target.division.cost(self.job.group.rank, self.job.network.halo)
+            cost += target.division.cost(self.job.team.group.rank, self.job.network.halo)
             own, result = self.job.gradient(index, self.sh_dc.detach(), style, target, scales, background)
             gradient = own if gradient is None else gradient.add_(own)
             results.append(result)
         assert gradient is not None
         if len(views) > 1:
             if self.job.team.groups > 1:  # all ranks of a group have the same gradient: count it once
-                with self.job.timer("communication"):
-                    gradient = self.job.collectives.all_reduce(gradient / self.job.group.size)
+                with self.job.loss.timer("communication"):
+                    gradient = self.job.collectives.all_reduce(gradient / self.job.team.group.size)
             gradient = gradient / len(views)
         if self._frozen is not None:
             gradient = gradient.masked_fill(self._frozen, 0)  # Adam does not change colors with zero gradient
@@ -746,7 +748,7 @@ class Stylizer:
         ]
         if self.job.team.groups > 1:
             with queued.timer("communication"):
-                every = self.job.collectives.all_gather(evaluations)[:: self.job.group.size]
+                every = self.job.collectives.all_gather(evaluations)[:: self.job.team.group.size]
             evaluations = [terms for part in every for terms in part]
         return mean_evaluation(evaluations)
 
@@ -807,7 +809,7 @@ class Stylizer:
         if not steps:
             return
         order = ViewOrder(self.job.views.covered, self.job.settings.seed)
-        with self.job.timer("prepare"):
+        with self.job.loss.timer("prepare"):
             for _ in range(steps):
                 views = [order.next_view() for _ in range(self.job.settings.views_per_step)]
                 for index in views[self.job.team.own_group :: self.job.team.groups]:

@@ -578,7 +578,7 @@ def test_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("standard", style_rotation=90, preserve_colors="match", style_scale=2, coarsest_side=24)
     scene, style = wall(), noise()
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
-    (used,) = stylizer.job.style.images
+    (used,) = stylizer.job.styles.own.images
     assert used.shape == (60, 40, 3)
     assert stylizer.job.loss.targets.style_scale == 2
     weights = stylizer.job.plan.survey.total_blend_weights

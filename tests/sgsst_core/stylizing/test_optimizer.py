@@ -233,7 +233,7 @@ def test_gradient_is_the_derivative_by_luminance(tiny_weights: BackboneWeights) 
     colors = (COLOR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
     image = rasterizer.render(colors, view)
     size = (view.height, view.width)
-    (painting,) = stylizer.job.style.images
+    (painting,) = stylizer.job.styles.own.images
     used = resize_area(painting, style_size((painting.shape[0], painting.shape[1]), size))
     _, pixels = sos_reference(stylizer.job.weights, image, used, image, coarsest=24)
     exact = rasterizer.color_gradient(pixels, view) * SH_C0 * (colors > 0)

@@ -206,7 +206,7 @@ def test_transfer_changes_results_but_not_optimized_colors(tiny_weights: Backbon
     assert rows.any()
     stylized = stylizer.stylized()
     weights = stylizer.job.plan.survey.total_blend_weights[stylizer.job.plan.seen]
-    wanted = warm_start(optimized, weights, stylizer.job.style)
+    wanted = warm_start(optimized, weights, stylizer.job.styles.own)
     assert torch.equal(stylized[rows], wanted[rows[stylizer.job.plan.seen]])
     assert float((wanted - optimized).abs().mean()) > 0.01
     assert torch.equal(stylizer.sh_dc, optimized)
