@@ -118,8 +118,8 @@ _GAUSSIANS, _CAMERAS = 20_000, 200
 #: Least fraction of the Gaussians in a frame, and of all, that the near plane hides if it is reported. Captures in
 #: meters have nearly none.
 _MUCH_OF_FRAMES, _MUCH_OF_SCENE = 0.1, 0.01
-#: Fraction of the Gaussians in the frames that may lie nearer than a suggested near plane, and its margin.
-_NEAREST, _MARGIN = 0.01, 0.5
+#: Fraction of the Gaussians in the frames that a suggested near plane may hide.
+_NEAREST = 0.01
 
 
 @dataclass(frozen=True)
@@ -129,14 +129,10 @@ class Shown:
     Attributes:
         typical: Fraction in one frame, median over the cameras.
         together: Fraction in at least one frame.
-        nearer: Fraction in at least one frame, but nearer than the near plane in all of these.
-        near: Distance of a near plane that hides nearly none of them; None if `nearer` is not remarkable.
     """
 
     typical: float
     together: float
-    nearer: float = 0.0
-    near: float | None = None
 
 
 def shown_by(means: Tensor, cameras: Sequence[Camera], near: float) -> Shown:
@@ -148,35 +144,29 @@ def shown_by(means: Tensor, cameras: Sequence[Camera], near: float) -> Shown:
         near: Distance of the near plane in world units.
     """
     points = means[:: max(1, len(means) // _GAUSSIANS)].double()
-    together, nearer = torch.zeros(2, len(points), dtype=torch.bool)
-    fractions, depths = [], []
+    together, fractions = torch.zeros(len(points), dtype=torch.bool), []
     for camera in spread(cameras, _CAMERAS):
         x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
         across, down = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (z > 0) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
-        depths.append(z[inside])
-        nearer |= inside & (z <= near)
-        inside &= z > near
+        inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
         together |= inside
         fractions.append(float(inside.double().mean()))
-    nearer &= ~together
-    hidden, in_frames = float(nearer.double().mean()), float((nearer | together).double().mean())
-    remarkable = hidden >= max(_MUCH_OF_SCENE, _MUCH_OF_FRAMES * in_frames)
-    suggested = _suggested(torch.cat(depths)) if remarkable else None
-    return Shown(median(fractions), float(together.double().mean()), hidden, suggested)
+    return Shown(median(fractions), float(together.double().mean()))
 
 
-def _suggested(depths: Tensor) -> float:
-    """Return a near plane with one digit, given the depths of Gaussians in frames."""
-    near = _MARGIN * float(depths.sort().values[int(_NEAREST * len(depths))])
-    digit = 10.0 ** math.floor(math.log10(max(near, 1e-30)))
-    return float(f"{math.floor(near / digit) * digit:.0e}") or near
+def near_plane(means: Tensor, cameras: Sequence[Camera], near: float) -> tuple[str, float] | None:
+    """Return how many Gaussians the near plane hides in the frames of cameras, and one that hides nearly none.
 
-
-def hidden_text(shown: Shown, gaussians: int, near: float) -> str:
-    """Return how many of a scene's Gaussians the near plane hides."""
-    count = round(shown.nearer * gaussians)
-    return f"{count:,} of {gaussians:,} Gaussians are in their frames, but nearer than the near plane at {near:g}"
+    The arguments are those of `shown_by`. The result is None if the near plane hides few.
+    """
+    drawn, in_frames = (shown_by(means, cameras, each).together for each in (near, 0.0))
+    if in_frames - drawn < max(_MUCH_OF_SCENE, _MUCH_OF_FRAMES * in_frames):
+        return None
+    nearer = (near / 10.0**power for power in range(1, 30))
+    enough = (each for each in nearer if shown_by(means, cameras, each).together >= (1 - _NEAREST) * in_frames)
+    count = round((in_frames - drawn) * len(means))
+    text = f"{count:,} of {len(means):,} Gaussians are in their frames, but nearer than the near plane at {near:g}"
+    return text, next(enough, near / 1e30)
 
 
 def nothing_seen(means: Tensor, cameras: Sequence[Camera], near: float) -> CameraError:
@@ -184,12 +174,9 @@ def nothing_seen(means: Tensor, cameras: Sequence[Camera], near: float) -> Camer
 
     The arguments are those of `shown_by`.
     """
-    shown = shown_by(means, cameras, near)
     none = f"None of the {len(cameras)} cameras sees a Gaussian"
-    if shown.near is not None:
-        return CameraError(
-            f"{none}: {hidden_text(shown, len(means), near)}. Add --near {shown.near:g}, which suits the scene's units."
-        )
+    if hidden := near_plane(means, cameras, near):
+        return CameraError(f"{none}: {hidden[0]}. Add --near {hidden[1]:g}, which suits the scene's units.")
     return CameraError(
         f"{none}. Check that cameras and scene belong together (same training run, same world), or let an orbit make "
         "the cameras."
@@ -242,10 +229,10 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
     """
     single = [camera for camera in cameras if camera.panorama is None]
     shown = shown_by(scene.means, single or cameras, near)
-    hidden = []
-    if shown.near is not None:
-        warning = f"warning: {hidden_text(shown, len(scene), near)}"
-        hidden = [Decision("cameras", warning, f"they are not drawn; add --near {shown.near:g} to draw them")]
+    hidden = [
+        Decision("cameras", f"warning: {text}", f"they are not drawn; add --near {closer:g} to draw them")
+        for text, closer in filter(None, [near_plane(scene.means, single or cameras, near)])
+    ]
     if not single or shown.typical >= _LITTLE_SHOWN or (hidden and shown.together):
         return hidden
     rasterizer = make_rasterizer("cpu", scene, near=near)
