@@ -31,7 +31,7 @@ from sgsst_core.files.atomic import write_json
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
-from sgsst_core.loss.terms import StyleTargets, ViewTarget, has_statistics
+from sgsst_core.loss.terms import StyleTargets, ViewTarget
 from sgsst_core.orbit import Orbit, orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives, Team
 from sgsst_core.planning.plan import (
@@ -376,13 +376,8 @@ def _about_inputs(
         reason = f"the style's colors differ from it by {255 * subspace.deviation:.1f} of 255 levels"
         yield Decision("color subspace", f"colors stay on {form} in RGB", reason, error=ANOTHER_LOSS)
     if len(style.images) > 1:
-        reason = f"{len(style.images)} images were given"
-        if not has_statistics(settings.style_loss):
-            reason += (
-                "; features are matched with those of all images, whose weights matter only if there are too many "
-                "features"
-            )
-        yield Decision("styles", f"a mixture: {style.text}", reason, error=ANOTHER_LOSS)
+        given = f"{len(style.images)} images were given"
+        yield Decision("styles", f"a mixture: {style.text}", given, error=ANOTHER_LOSS)
 
 
 # --- preparation ---------------------------------------------------------------------------------------------------

@@ -20,8 +20,10 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import scipy  # imports its modules at first use
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
@@ -63,7 +65,7 @@ _FARTHEST = 10.0
 #: "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
 _PSI = 1.533751168755204288118041
 #: Transport along one axis: values in ascending order and their targets, [k] each.
-_Map = tuple[Tensor, Tensor]
+_Map = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def warm_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
@@ -198,7 +200,6 @@ def _rounds(source: Tensor, counts: Tensor, wanted: Tensor) -> list[tuple[Tensor
     once = torch.ones_like(wanted[:, 0], dtype=counts.dtype)
     rounds: list[tuple[Tensor, list[_Map]]] = []
     for axes in _round_axes():
-        axes = axes.to(source.device)
         along = zip((source @ axes).unbind(1), (wanted @ axes).unbind(1), strict=True)
         maps = [_along(_quantiles(values, counts), _quantiles(others, once)) for values, others in along]
         rounds.append((axes, maps))
@@ -207,10 +208,11 @@ def _rounds(source: Tensor, counts: Tensor, wanted: Tensor) -> list[tuple[Tensor
 
 
 def _through(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
-    """Apply the maps of some rounds to colors [n, 3]."""
+    """Apply the maps of some rounds to colors [n, 3]; they are piecewise linear, and constant beyond their ends."""
     for axes, maps in rounds:
         along = zip((colors @ axes).unbind(1), maps, strict=True)
-        colors = torch.stack([_mapped(values, *map_) for values, map_ in along], dim=1) @ axes.T
+        moved = [torch.from_numpy(np.interp(values.numpy(), *map_)) for values, map_ in along]
+        colors = torch.stack(moved, dim=1) @ axes.T
     return colors
 
 
@@ -223,7 +225,7 @@ def _drawn(weights: Tensor) -> tuple[Tensor, Tensor]:
         Indices [n] of the different samples, and how many times [n] each was drawn: few for a small scene.
     """
     running = weights.cumsum(0)
-    steps = (torch.arange(_SAMPLES, dtype=running.dtype, device=running.device) + 0.5) * (running[-1] / _SAMPLES)
+    steps = (torch.arange(_SAMPLES, dtype=running.dtype) + 0.5) * (running[-1] / _SAMPLES)
     drawn = torch.searchsorted(running, steps).clamp_max(len(weights) - 1)
     indices, counts = torch.unique_consecutive(drawn, return_counts=True)
     return indices, counts
@@ -249,7 +251,7 @@ def _along(knots: Tensor, targets: Tensor) -> _Map:
     group = apart.cumsum(0) - 1
     counts = torch.bincount(group).to(knots)
     sums = (torch.zeros_like(counts).index_add_(0, group, each) for each in (knots, targets))
-    return next(sums) / counts, next(sums) / counts
+    return (next(sums) / counts).numpy(), (next(sums) / counts).numpy()
 
 
 def _quantiles(values: Tensor, counts: Tensor) -> Tensor:
@@ -258,16 +260,6 @@ def _quantiles(values: Tensor, counts: Tensor) -> Tensor:
     ends = counts[order].cumsum(0)
     positions = torch.linspace(0, int(ends[-1]) - 1, _KNOTS, dtype=torch.float64, device=values.device)
     return ordered[torch.searchsorted(ends, positions.round().long(), right=True)]
-
-
-def _mapped(values: Tensor, knots: Tensor, targets: Tensor) -> Tensor:
-    """Map values [n] by a piecewise linear function that is constant beyond its ends."""
-    if len(knots) == 1:
-        return targets.expand(len(values))
-    index = torch.searchsorted(knots, values.contiguous()).clamp(1, len(knots) - 1)
-    low, high = knots[index - 1], knots[index]
-    fraction = ((values - low) / (high - low)).clamp(0, 1)
-    return torch.lerp(targets[index - 1], targets[index], fraction)
 
 
 @dataclass(frozen=True)
