@@ -139,7 +139,6 @@ class NetworkPixels:
         sampled: The same with the scales that a mean step of phase 2 evaluates (`Settings.scale_sampling`).
         coarse: The same with the coarsest scale alone.
         again: Pixels through a second forward pass, because their activations do not fit in memory.
-        without_region: Value of `all` if uncovered pixels were processed too.
         tiles: Maximum number of tiles of a view at one scale.
         held: Maximum number of pixels in memory at a time, including the temporary memory of a pass in units of pixels.
     """
@@ -148,33 +147,30 @@ class NetworkPixels:
     sampled: float = 0.0
     coarse: float = 0.0
     again: float = 0.0
-    without_region: float = 0.0
     tiles: int = 0
     held: float = 0.0
 
     @staticmethod
     def of(facts: Facts, settings: Settings, *, weighted: bool) -> NetworkPixels:
         """Count the pixels of the views that see anything."""
-        total, sampled, coarse, again, without, held, tiles = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
+        total, sampled, coarse, again, held, tiles = 0.0, 0.0, 0.0, 0.0, 0.0, 0
         tiling, views = facts.tiling, facts.survey.covered
         for index in views:
             size, passed = facts.sizes[index], list[int]()
             for scale in reversed(tiling.scales(size)):  # coarsest first
                 own = (size[0] >> scale, size[1] >> scale)
                 region = scaled_region(facts.survey.regions[index], scale, own) if weighted else None
-                areas, whole = ([t.outer.pixels for t in tiling.tiles(own, each)] for each in (region, None))
+                areas = [tile.outer.pixels for tile in tiling.tiles(own, region)]
                 flags = tiling.cached(areas)
                 twice, largest = computed_twice(areas, flags), max(areas, default=0)
                 passed.append(sum(areas))
-                again, without, tiles = again + twice, without + sum(whole), max(tiles, len(areas))
+                again, tiles = again + twice, max(tiles, len(areas))
                 once = max((area for area, flag in zip(areas, flags, strict=True) if not flag), default=0)
                 held = max(held, sum(areas) - twice + tiling.working * largest, (1 + tiling.working) * once)
             total, coarse = total + sum(passed), coarse + passed[0]
             sampled += sum(own * float(settings.scale_sampling) ** -place for place, own in enumerate(passed))
-        total, sampled, coarse, again, without = (
-            each / len(views) for each in (total, sampled, coarse, again, without)
-        )
-        return NetworkPixels(total, sampled, coarse, again, without, tiles, held)
+        total, sampled, coarse, again = (each / len(views) for each in (total, sampled, coarse, again))
+        return NetworkPixels(total, sampled, coarse, again, tiles, held)
 
 
 @dataclass(frozen=True)
@@ -541,7 +537,7 @@ def make_plan(
     lines = (
         *about,
         *_about_gaussians(plan, facts, settings),
-        *_about_coverage(plan, facts, settings, pixels),
+        *_about_coverage(plan, facts, settings),
         *_about_network(facts, settings, pixels),
         *_about_rasterizer(plan, facts),
         about_weights,
@@ -724,16 +720,14 @@ def _about_gaussians(plan: Plan, facts: Facts, settings: Settings) -> Iterator[D
         yield Decision("view-dependent color", advice, reason)
 
 
-def _about_coverage(plan: Plan, facts: Facts, settings: Settings, pixels: NetworkPixels) -> Iterator[Decision]:
+def _about_coverage(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
     """Yield the decisions about empty views, uncovered pixels, backgrounds, and the colors at the start."""
     uncovered = f"{plan.survey.uncovered_fraction:.1%} of the views' pixels are uncovered"
     total, blind = len(facts.sizes), len(facts.sizes) - len(plan.covered)
     if blind:
         yield Decision(VIEWS, f"{blind} of {total} are skipped", "they see no Gaussian")
-    if pixels.all < pixels.without_region:
-        skipped = f"{1 - pixels.all / pixels.without_region:.0%} of the pixels skip the network"
-        yield Decision("uncovered pixels", skipped, uncovered)
     if plan.weighted:
+        yield Decision("uncovered pixels", "tiles and borders without covered pixels skip the network", uncovered)
         yield Decision("position weights", "statistics are weighted by coverage", uncovered, error=ANOTHER_LOSS)
     if plan.training_background != "background":
         random, requested = plan.training_background == "random", settings.training_background != "auto"

@@ -179,7 +179,7 @@ class _Refining:
 
     def _gradient_disagreement(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return the sum over some views of the `disagreement` of the style loss gradient."""
-        settings, cameras, total = self._settings, self._planning_context.cameras, self._footprints.weights
+        settings, total = self._settings, self._footprints.weights
         network = self._planning_context.network()
         style = prepared_style(self._given, settings, self._scene.sh_dc, total)
         style = style.map(lambda image: image.to(network.device))
@@ -191,10 +191,9 @@ class _Refining:
         )
         targets: dict[tuple[int, int], StyleTargets] = {}
         sums = torch.zeros((len(scene), 2), dtype=torch.float64)
-        for done, index in enumerate(self._of_this_rank(views)):
+        for done, (_, camera) in enumerate(self._of_this_rank(views)):
             if self._show:
                 self._show(progress_of(done, len(views), self._collectives.size, "refining"))
-            camera = cameras[index]
             size = (camera.height, camera.width)
             if size not in targets:
                 targets[size] = loss.targets.of_style(style, size)
@@ -215,8 +214,7 @@ class _Refining:
         scene = self._fit(scene, rasterizer, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
         squared = torch.zeros(len(self._scene), dtype=torch.float64)
         errors: dict[int, float] = {}
-        for index in self._of_this_rank(views):
-            camera = self._planning_context.cameras[index]
+        for index, camera in self._of_this_rank(views):
             before = render(self._scene, self._rasterizer, camera).clamp(0, 1)
             change = (render(scene, rasterizer, camera).clamp(0, 1) - before).square()
             errors[index] = float(change.mean(dtype=torch.float64))
@@ -234,8 +232,7 @@ class _Refining:
         children = children.to(self._rasterizer.device)
         for _ in range(_FITTING_STEPS):
             lacks = torch.zeros((len(scene), 4), dtype=torch.float64, device=self._rasterizer.device)
-            for index in self._of_this_rank(views):
-                camera = self._planning_context.cameras[index]
+            for _, camera in self._of_this_rank(views):
                 missing = render(self._scene, self._rasterizer, camera) - render(scene, rasterizer, camera)
                 lacks[:, :3] += rasterizer.color_gradient(missing, camera)
                 lacks[:, 3] += rasterizer.survey(camera)[1]
@@ -256,9 +253,10 @@ class _Refining:
         fewer[worst] = 1
         return fewer
 
-    def _of_this_rank(self, views: Sequence[int]) -> Sequence[int]:
-        """Return the views that this rank processes."""
-        return views[self._collectives.rank :: self._collectives.size]
+    def _of_this_rank(self, views: Sequence[int]) -> list[tuple[int, Camera]]:
+        """Return the views that this rank processes, with their cameras."""
+        own = views[self._collectives.rank :: self._collectives.size]
+        return [(index, self._planning_context.cameras[index]) for index in own]
 
     def _sum(self, values: Tensor) -> Tensor:
         """Return the sum over all ranks."""
