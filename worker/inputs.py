@@ -63,7 +63,7 @@ from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
-from sgsst_core.stylizing.job import check_style_size
+from sgsst_core.stylizing.styles import check_style_size
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import REST, RegionRequest, Selection, StyleFile

@@ -58,7 +58,8 @@ from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.job import in_bfloat16
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.stylizer import Stylizer, constrained, mean_loss
+from sgsst_core.stylizing.styles import constrained
+from sgsst_core.stylizing.stylizer import Stylizer, mean_loss
 from worker.ranks.process_group import process_group
 
 #: Relative error bound of loss and pixel gradient of the last image against float64.

@@ -684,13 +684,16 @@ def _with_memory(plan: Plan, facts: Facts, pixels: NetworkPixels) -> Plan:
     areas = sum(facts.sizes[index][0] * facts.sizes[index][1] for index in plan.covered)
     of_views = int(4 / 3 * _TARGET_BYTES * areas) + 12 * facts.gaussians * len(plan.covered) * bool(facts.used_degree)
     cached = 0 if plan.cached_weights == "none" else (facts.weight_bytes or (0, 0))[plan.cached_weights == "half"]
-    used = needed + min(of_views, memory_for("views", memory) + spare // 2)
-    used += min(facts.intersection_bytes + cached, memory_for("rasterizer", memory) + spare // 2)
-    used += min(memory_for("measuring", memory), 4 * plan.novel_views * _TARGET_BYTES * areas // len(plan.covered))
+    of_novel_views = 4 * plan.novel_views * _TARGET_BYTES * areas // len(plan.covered)
+    used = (
+        needed
+        + min(of_views, memory_for("views", memory) + spare // 2)
+        + min(facts.intersection_bytes + cached, memory_for("rasterizer", memory) + spare // 2)
+        + min(of_novel_views, memory_for("measuring", memory))
+    )
     of_scene = facts.gaussians * (_GAUSSIAN_BYTES + 24 * (facts.sh_degree + 1) ** 2)
-    process, device = _PROCESS_BYTES + of_scene + (used if plan.device == "cpu" else 0), None
-    if plan.device == "cuda":
-        device = used + of_scene
+    process = _PROCESS_BYTES + of_scene + (used if plan.device == "cpu" else 0)
+    device = used + of_scene if plan.device == "cuda" else None
     return replace(plan, spare=spare, peak_bytes=process, device_bytes=device)
 
 

@@ -487,12 +487,11 @@ def _make_rasterizer(
 ) -> Rasterizer:
     """Return the plan's rasterizer of the rendered Gaussians."""
     budget = memory_for("rasterizer", memory)
-    if planning_context and plan.seen.all():
-        uncached = planning_context.rasterizer
-    else:
-        uncached = make_rasterizer(
-            plan.uncached, rendered, background=settings.background, near=settings.near, memory=budget
-        )
+    uncached = (
+        planning_context.rasterizer
+        if planning_context and plan.seen.all()
+        else make_rasterizer(plan.uncached, rendered, background=settings.background, near=settings.near, memory=budget)
+    )
     if plan.cached_weights == "none":
         return uncached
     return CachedRasterizer(
@@ -507,12 +506,9 @@ def _make_rasterizer(
 
 def view_memory(plan: Plan, memory: int) -> int:
     """Return the budget in bytes for data of the views: what other caches leave of it, and half of `Plan.spare`."""
-    left = memory_for("views", memory) + plan.spare // 2
-    if plan.cached_weights != "none":
-        left -= memory_for("intersections", memory)
-    if plan.measured:
-        left -= (2 if plan.is_approximated else 1) * memory_for("measuring", memory)
-    return left
+    measuring = (1 + plan.is_approximated) * plan.measured * memory_for("measuring", memory)
+    cached = (plan.cached_weights != "none") * memory_for("intersections", memory)
+    return memory_for("views", memory) + plan.spare // 2 - cached - measuring
 
 
 def with_second_attempt(job: StylizationJob, work: Callable[[], T]) -> T:

@@ -8,10 +8,10 @@ gradient shows where texture is needed.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from sgsst_core.budget import memory_for
 from sgsst_core.constants import SH_C0
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.sos import make_loss
-from sgsst_core.loss.terms import StyleTargets, ViewTarget
+from sgsst_core.loss.terms import ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.plan import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, psnr, survey_views
@@ -43,8 +43,8 @@ from sgsst_core.scene.camera import Camera, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs, prepared_style
-from sgsst_core.stylizing.styles import with_moments
+from sgsst_core.stylizing.job import JobInputs
+from sgsst_core.stylizing.styles import JobStyles, prepared_style, with_moments
 
 #: Number of evenly spread views whose gradient is computed; each costs an iteration.
 GRADIENT_VIEWS = 24
@@ -161,7 +161,7 @@ class _Refining:
             change = self._change(pieces, fitted, views)
             if change.lowest >= MIN_PSNR:
                 return pieces, change
-            pieces = self._collectives.broadcast(partial(self._undo_the_worst, pieces, change))
+            pieces = self._collectives.broadcast(functools.partial(self._undo_the_worst, pieces, change))
         return torch.ones_like(pieces), None
 
     def _survey(self) -> list[int]:
@@ -182,25 +182,21 @@ class _Refining:
         settings, total = self._settings, self._footprints.weights
         network = self._planning_context.network()
         style = prepared_style(self._given, settings, self._scene.sh_dc, total)
-        style = style.map(lambda image: image.to(network.device))
         scene = replace(self._scene, sh_dc=with_moments(self._scene.sh_dc, total, style))
         loss = make_loss(
             network,
             settings.model_copy(update={"content_weight": 0.0}),
             memory_for("activations", self._planning_context.machine.memory),
         )
-        targets: dict[tuple[int, int], StyleTargets] = {}
+        targets = JobStyles(style).cached_targets(loss)
         sums = torch.zeros((len(scene), 2), dtype=torch.float64)
         for done, (_, camera) in enumerate(self._of_this_rank(views)):
             if self._show:
                 self._show(progress_of(done, len(views), self._collectives.size, "refining"))
-            size = (camera.height, camera.width)
-            if size not in targets:
-                targets[size] = loss.targets.of_style(style, size)
             image = render(scene, self._rasterizer, camera)
             weighted = settings.position_weights != "off"
             weights = loss.targets.position_weights(self._rasterizer.coverage(camera)) if weighted else None
-            gradient = loss.evaluate(image, targets[size], ViewTarget(coverage=weights)).image_gradient
+            gradient = loss.evaluate(image, targets(camera), ViewTarget(coverage=weights)).image_gradient
             assert gradient is not None
             gradient = gradient.to(self._rasterizer.device, self._rasterizer.dtype)
             sums += torch.stack(disagreement(self._rasterizer, camera, gradient), dim=1)

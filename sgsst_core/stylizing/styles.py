@@ -18,7 +18,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy  # imports its modules at first use
@@ -317,28 +317,22 @@ class JobStyles:
         """All distinct styles in use."""
         return [*{id(style): style for style in self.each or (self.own,)}.values()]
 
-    def to(self, device: torch.device) -> JobStyles:
-        """Return the styles with their images on a device."""
-
-        def move(style: Style) -> Style:
-            return style.map(lambda image: image.to(device))
-
-        return replace(self, own=move(self.own), each=tuple(map(move, self.each)))
-
     def cached_targets(self, loss: SosLoss) -> Callable[[Camera], StyleTargets]:
         """Return a function that returns the targets for views of a camera's size, computed at first use."""
-        styles = self.to(loss.network.device)
-        targets = functools.cache(functools.partial(styles.targets, loss))
+        targets = functools.cache(functools.partial(self.targets, loss))
         return lambda camera: targets((camera.height, camera.width))
 
     def targets(self, loss: SosLoss, view_size: Size) -> StyleTargets:
         """Compute the targets for views of a size (height, width); see `TargetBuilder.of_style`."""
+
+        def of(style: Style) -> StyleTargets:
+            return loss.targets.of_style(style.map(lambda image: image.to(loss.network.device)), view_size)
+
         if not self.each:
-            return loss.targets.of_style(self.own, view_size)
+            return of(self.own)
         assert self.regions is not None
         weights = [self.regions.every[index].weight for index in self.regions.active]
-        targets = [loss.targets.of_style(style, view_size) for style in self.each]
-        return combined(targets, weights)
+        return combined([of(style) for style in self.each], weights)
 
     def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, preserve_chroma: bool = False) -> Tensor:
         """Transfer to each Gaussian the colors of its region's style; see `warm_start`.

@@ -760,12 +760,11 @@ class Stylizer:
             first: First view of the step, whose draw applies to all of them, so that no group of ranks waits.
         """
         chosen, settings = phase.scales(self.job.scales(index)), self.job.settings
-        period = settings.scale_sampling
-        if period == 1 or len(chosen) == 1:
+        if settings.scale_sampling == 1 or len(chosen) == 1:
             return chosen
         visit = step * settings.views_per_step // len(self.job.views.covered)
-        drawn = drawn_scales(chosen, period, settings.seed, first, visit)
-        return self.job.loss.weights.sampled(chosen, drawn, period)
+        drawn = drawn_scales(chosen, settings.scale_sampling, settings.seed, first, visit)
+        return self.job.loss.weights.sampled(chosen, drawn, settings.scale_sampling)
 
     def evaluate(
         self, indices: Sequence[int], sh_dc: Tensor | None = None, show: ShowViews = show_nothing

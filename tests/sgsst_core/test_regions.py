@@ -42,8 +42,9 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import MAX_RESOLUTION, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkpoint, save_checkpoint, versions
-from sgsst_core.stylizing.job import JobInputs, check_style_size, prepare_job, prepared_style, rotated
+from sgsst_core.stylizing.job import JobInputs, prepare_job
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.styles import check_style_size, prepared_style, rotated
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import LFS_POINTER, ball, cameras, style, wall, write_files

@@ -41,7 +41,8 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import save_plan
 from sgsst_core.stylizing.job import JobInputs, plan_job
 from sgsst_core.stylizing.loop import Callbacks, run
-from sgsst_core.stylizing.stylizer import Stylizer, neighbors_change
+from sgsst_core.stylizing.styles import neighbors_change
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, style, wall
 

@@ -17,9 +17,8 @@ from sgsst_core.scene.colors import LARGEST, gray, luminance, resize_area, style
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import prepared_style
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.styles import luminance_start
+from sgsst_core.stylizing.styles import luminance_start, prepared_style
 from sgsst_core.stylizing.stylizer import ADAM_EPS, LARGEST_GRADIENT, ColorOptimizer, Stylizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, style, wall

@@ -24,8 +24,9 @@ from sgsst_core.scene.colors import gray
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs, JobStyles, plan_job, prepare_job
+from sgsst_core.stylizing.job import JobInputs, plan_job, prepare_job
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.styles import JobStyles
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views, ViewTargets
 from tests.networks import comparing_pixels, tiny_weights
