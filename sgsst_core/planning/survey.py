@@ -7,6 +7,7 @@ are distributed among ranks. The thresholds of the checks separate real captures
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +24,7 @@ from sgsst_core.progress import Decision, Progress
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 #: Below this coverage, the color of a pixel is invisible in 8 bits.
 SEEN_COVERAGE = 1 / 255
@@ -291,13 +292,13 @@ def compare_photos(
     Raises:
         ImageError: If a photo cannot be read.
     """
-    likeness = _Likeness(scene, near)
+    likeness = functools.partial(_likeness, scene, make_rasterizer("cpu", scene, near=near))
     photos, decisions = list(photos), []
     doubtful = [index for index, photo in enumerate(photos) if photo.ambiguous]
     if doubtful:
         some = spread(doubtful, _VIEWS)
-        stored = mean(likeness.psnr(photos[index], cameras[index]) or 0.0 for index in some)
-        oriented = mean(likeness.psnr(replace(photos[index], oriented=True), cameras[index]) or 0.0 for index in some)
+        stored = mean(likeness(photos[index], cameras[index]) or 0.0 for index in some)
+        oriented = mean(likeness(replace(photos[index], oriented=True), cameras[index]) or 0.0 for index in some)
         if oriented > stored:
             photos = [replace(photo, oriented=True) if photo.ambiguous else photo for photo in photos]
         used = f"the EXIF orientation of {len(doubtful)} photos is {'applied' if oriented > stored else 'ignored'}"
@@ -306,7 +307,7 @@ def compare_photos(
         )
         decisions.append(Decision("photos", used, reason))
     pairs = spread(list(zip(photos, cameras, strict=True)), _VIEWS)
-    values = [likeness.psnr(photo, camera) for photo, camera in pairs]
+    values = [likeness(photo, camera) for photo, camera in pairs]
     psnr = median([value for value in values if value is not None] or [math.inf])
     if psnr < _UNLIKE_PSNR:
         decisions.append(
@@ -321,26 +322,14 @@ def compare_photos(
     return photos, decisions
 
 
-class _Likeness:
-    """Comparison of photos with small renders of a scene."""
-
-    def __init__(self, scene: Scene, near: float) -> None:
-        self._scene, self._rasterizer = scene, make_rasterizer("cpu", scene, near=near)
-        self._renders: dict[bytes, tuple[Tensor, Tensor]] = {}
-
-    def psnr(self, photo: Photo, camera: Camera) -> float | None:
-        """Return the PSNR in dB of a photo against its view's render; None if the scene covers too little of it."""
-        view = resized(camera, min(camera.side, _SIDE))
-        key = view.world_to_camera.numpy().tobytes()  # names may repeat
-        if key not in self._renders:
-            colors = view_colors(self._scene.sh_dc, rest_colors(self._scene.sh_rest, self._scene.means, view))
-            coverage = self._rasterizer.coverage(view)[..., None]
-            self._renders[key] = _averaged(self._rasterizer.render(colors, view)), _averaged(coverage)[..., 0]
-        render, coverage = self._renders[key]
-        compared = coverage > _COVERED
-        if float(compared.double().mean()) < _LEAST_COMPARED:
-            return None
-        return fitted_psnr(_averaged(load_photo(photo, view)), render, compared)
+def _likeness(scene: Scene, rasterizer: Rasterizer, photo: Photo, camera: Camera) -> float | None:
+    """Return the PSNR in dB of a photo against its view's render; None if the scene covers too little of it."""
+    view = resized(camera, min(camera.side, _SIDE))
+    compared = _averaged(rasterizer.coverage(view)[..., None])[..., 0] > _COVERED
+    if float(compared.double().mean()) < _LEAST_COMPARED:
+        return None
+    render = _averaged(rasterizer.render(scene_colors(scene, view), view))
+    return fitted_psnr(_averaged(load_photo(photo, view)), render, compared)
 
 
 def _averaged(image: Tensor) -> Tensor:

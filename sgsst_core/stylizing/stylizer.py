@@ -201,12 +201,11 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     colors, subspace = job.scene.sh_dc.clone(), job.styles.color_subspace(job.settings)
     colors[job.plan.seen] = optimized
     if transfer:
-        colors[job.plan.seen] = transferred = transferred_colors(job, optimized)
-        if job.preserves_chroma or subspace is not None:
-            chroma_of = job.scene.sh_dc[job.plan.seen] if job.preserves_chroma else None
-            bounded = constrained(transferred, chroma_of, subspace, bounded=job.settings.bounded)
-            # Frozen colors remain bit-identical.
-            colors[job.plan.seen] = torch.where(transferred != optimized, bounded, optimized)
+        transferred = transferred_colors(job, optimized)
+        chroma_of = job.scene.sh_dc[job.plan.seen] if job.preserves_chroma else None
+        bounded = constrained(transferred, chroma_of, subspace, bounded=job.settings.bounded)
+        # Frozen colors remain bit-identical.
+        colors[job.plan.seen] = torch.where(transferred != optimized, bounded, optimized)
     if job.settings.unseen != "neighbors":
         return colors
     weights = torch.where(job.plan.optimized, job.plan.survey.total_blend_weights, 0.0)
