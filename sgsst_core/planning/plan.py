@@ -110,7 +110,6 @@ class Facts:
             cannot cache them.
         intersection_bytes: Bytes of the tile intersections of all views.
         frozen: [N] bool, frozen Gaussians; None if there are none.
-        deepest: Name of the deepest layer in use.
     """
 
     gaussians: int
@@ -127,7 +126,6 @@ class Facts:
     weight_bytes: tuple[int, int] | None = None
     intersection_bytes: int = 0
     frozen: Tensor | None = None
-    deepest: str = "relu5_1"
 
 
 @dataclass(frozen=True)
@@ -181,7 +179,6 @@ class PlanningContext:
         scene: Whole scene, with the SH attenuation of the settings applied.
         cameras: Cameras at the size used for stylization.
         rasterizer: Rasterizer of the whole scene that computes blend weights.
-        sh_degree: SH degree of the original scene.
         networks: Networks created so far, by precision.
     """
 
@@ -191,7 +188,6 @@ class PlanningContext:
     machine: Machine
     weights: BackboneWeights
     rasterizer: Rasterizer
-    sh_degree: int
     networks: dict[PlannedPrecision, FeatureNetwork] = field(default_factory=dict)
 
     def network(self, precision: PlannedPrecision = "float32") -> FeatureNetwork:
@@ -216,12 +212,12 @@ def equip(
         cameras: Cameras at the size used for stylization.
         rasterizer: Rasterizer that computes blend weights; None to choose one.
     """
-    sh_degree, scene = scene.sh_degree, scene.attenuated(settings.sh_attenuation)
+    scene = scene.attenuated(settings.sh_attenuation)
     machine = describe_machine(settings, collectives)
     name = rasterizer or rasterizer_for(machine.device, machine.problems)
     memory = memory_for("rasterizer", machine.memory)
     of_scene = make_rasterizer(name, scene, background=settings.background, near=settings.near, memory=memory)
-    return PlanningContext(scene, tuple(cameras), settings, machine, weights, of_scene, sh_degree)
+    return PlanningContext(scene, tuple(cameras), settings, machine, weights, of_scene)
 
 
 def describe_machine(settings: Settings, collectives: Collectives) -> Machine:
@@ -618,15 +614,6 @@ def _visits(plan: Plan, settings: Settings) -> int:
     return (plan.steps_coarse + settings.steps_sos) * settings.views_per_step
 
 
-def _visits_of_a_size(plan: Plan, facts: Facts, settings: Settings) -> int:
-    """Return the passes of images of one size through the network in the whole schedule.
-
-    With weighted statistics, every view has its own size, because it is cropped to its covered pixels.
-    """
-    different = len(plan.covered) if plan.weighted else len({facts.sizes[index] for index in plan.covered})
-    return _visits(plan, settings) // different
-
-
 def _blend_weights(plan: Plan, facts: Facts, settings: Settings) -> tuple[CachedWeights, Decision]:
     """Choose the format of cached blend weights: float32 or half precision, as fits; none if it saves no time."""
     item, why_not = "blend weights", _why_not_cached(plan, facts, settings)
@@ -662,7 +649,9 @@ def _has_graphs(plan: Plan, facts: Facts, settings: Settings) -> bool:
     """Return whether the loss of a view is captured as a CUDA graph. A graph cannot contain communication."""
     alone = plan.ranks == math.gcd(settings.views_per_step, plan.ranks)  # no two ranks work on the same view
     small = max(height * width for height, width in facts.sizes) <= _GRAPH_PIXELS
-    return facts.machine.graphs and alone and small and _visits_of_a_size(plan, facts, settings) >= _GRAPH_VISITS
+    # With weighted statistics, every view has its own size, because it is cropped to its covered pixels.
+    sizes = len(plan.covered) if plan.weighted else len({facts.sizes[index] for index in plan.covered})
+    return facts.machine.graphs and alone and small and _visits(plan, settings) // sizes >= _GRAPH_VISITS
 
 
 def _novel_views(plan: Plan, settings: Settings) -> int:
@@ -751,9 +740,7 @@ def _about_coverage(plan: Plan, facts: Facts, settings: Settings) -> Iterator[De
 
 
 def _about_network(facts: Facts, settings: Settings, pixels: NetworkPixels) -> Iterator[Decision]:
-    """Yield the decisions about layers, style loss, content, partition and forward passes."""
-    layers = f"up to {facts.deepest}, the deepest one used"
-    yield Decision("network layers", layers, "the loss reads no deeper layer")
+    """Yield the decisions about style loss, partition and forward passes."""
     if settings.style_loss != "sos":
         what = "replaces the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
         distance = (
@@ -761,8 +748,6 @@ def _about_network(facts: Facts, settings: Settings, pixels: NetworkPixels) -> I
             f"weight {NEAREST_WEIGHTS[settings.style_loss]:.3g}"
         )
         yield Decision("style loss", distance, f"{settings.style_loss} was requested", error=ANOTHER_LOSS)
-    if not settings.content_weight:
-        yield Decision("content", "no content features are computed or cached", "its weight is 0")
     memory = f"the {memory_for('activations', facts.machine.memory) / 1e9:.1f} GB for activations"
     whole = "none: the network takes each view as a whole"
     tiles = whole if pixels.tiles <= 1 else f"up to {pixels.tiles} tiles per view"

@@ -277,7 +277,7 @@ def plan_job(
                 with timer("survey"):
                     survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
             about = [*_about_inputs(inputs, settings, survey, fitted)]
-            facts = collectives.broadcast(lambda: _facts(context, survey, inputs.regions))
+            facts = collectives.broadcast(lambda: _facts(context, survey, inputs))
             plan = make_plan(facts, settings, groups=groups, measured=inputs.measured, about=about)
             plan = replace(plan, refinement=inputs.refinement, time_choice=chosen)
     if chosen and not plan.steps_coarse:  # so that the learning rate falls alike for any number of steps
@@ -329,7 +329,7 @@ def choose_within(inputs: JobInputs, left: SecondsLeft, collectives: Collectives
     return collectives.broadcast(choice)
 
 
-def _facts(context: PlanningContext, survey: Survey, regions: Regions | None) -> Facts:
+def _facts(context: PlanningContext, survey: Survey, inputs: JobInputs) -> Facts:
     """Gather the facts on which the plan depends; one rank does this for all."""
     scene, settings, machine = context.scene, context.settings, context.machine
     views = [context.cameras[index] for index in survey.covered]
@@ -337,7 +337,7 @@ def _facts(context: PlanningContext, survey: Survey, regions: Regions | None) ->
     network = context.network(precision)
     return Facts(
         gaussians=len(scene),
-        sh_degree=context.sh_degree,
+        sh_degree=inputs.scene.sh_degree,
         used_degree=scene.used_degree(survey.total_blend_weights > 0),
         harmonics_energy=harmonics_energy(scene, survey.total_blend_weights),
         sizes=tuple((camera.height, camera.width) for camera in context.cameras),
@@ -349,8 +349,7 @@ def _facts(context: PlanningContext, survey: Survey, regions: Regions | None) ->
         pixel_bytes=network.held_bytes_per_pixel(),
         weight_bytes=count_weights(context.rasterizer, views),
         intersection_bytes=count_intersections(context.rasterizer, len(views)),
-        frozen=None if regions is None else regions.resolved(survey.total_blend_weights).frozen,
-        deepest=max(network.layers),
+        frozen=inputs.regions and inputs.regions.resolved(survey.total_blend_weights).frozen,
     )
 
 

@@ -92,9 +92,6 @@ class Views:
         self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4)
         self._sh_dc = scene.sh_dc.to(rasterizer.device)
 
-    def __len__(self) -> int:
-        return len(self.cameras)
-
     def render(self, index: int, colors: Tensor, rasterizer: Rasterizer | None = None) -> Tensor:
         """Return the image of a view; with several ranks, of the rectangle [h, w, 3] that this rank renders.
 
@@ -346,7 +343,10 @@ class ViewTargets:
 
         It is cached if it fits.
         """
-        return self._coverage.get(index, lambda: self._rendered_coverage(index))
+        views, render = self.views, self.views.rasterizer.repeatable.coverage
+        return self._coverage.get(
+            index, lambda: self.loss.targets.position_weights(views.whole(index, views.window(index, render)))
+        )
 
     def region_weights(self, index: int) -> list[list[Tensor]] | None:
         """Return the map of each region in a view, in the format of `coverage`; None if the scene has no regions."""
@@ -409,10 +409,6 @@ class ViewTargets:
                 on_gpu = self.loss.network.device.type != "cpu"
                 self._divisions[key] = divider.divide(sizes, coverage, known if on_gpu else None)
         return self._divisions[key]
-
-    def _rendered_coverage(self, index: int) -> list[Tensor]:
-        window = self.views.window(index, self.views.rasterizer.repeatable.coverage)
-        return self.loss.targets.position_weights(self.views.whole(index, window))
 
     def _rendered_maps(self, index: int, render: Callable[[Camera], Tensor], count: int) -> list[list[Tensor]]:
         whole = self.views.whole(index, self.views.window(index, render, count))

@@ -147,7 +147,6 @@ def test_decisions_name_skipped_work(tiny_weights: BackboneWeights) -> None:
         "uncovered pixels",
         "position weights",
         "phase 1",
-        "content",
         "partition",
     }
     assert (decisions["unseen Gaussians"].bytes or 0) == int((~plan.seen).sum()) * 48
