@@ -325,13 +325,11 @@ def describe_scene(file: SceneFile) -> str:
 
 
 def _describe_views(job: Job) -> str:
-    views = job.stylizer.job.views
-    sizes = sorted({(camera.width, camera.height) for camera in views.cameras})
-    text = f"{len(views.cameras)} of {sizes[0][0]}x{sizes[0][1]}"
+    cameras = job.stylizer.job.views.cameras
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    text = f"{len(cameras)} of {sizes[0][0]}x{sizes[0][1]}"
     if len(sizes) > 1:
-        text = (
-            f"{len(views.cameras)} of {len(sizes)} sizes, {sizes[0][0]}x{sizes[0][1]} to {sizes[-1][0]}x{sizes[-1][1]}"
-        )
+        text = f"{len(cameras)} of {len(sizes)} sizes, {sizes[0][0]}x{sizes[0][1]} to {sizes[-1][0]}x{sizes[-1][1]}"
     tiling = job.stylizer.job.loss.tiling
     scales = max(tiling.scale_count((height, width)) for width, height in sizes)
     chosen = max(len(tiling.scales((height, width))) for width, height in sizes)
