@@ -6,7 +6,6 @@ first job on a machine compiles them, and so does each of the service's confined
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
 import os
 import shutil
@@ -57,12 +56,7 @@ def findings() -> Iterator[Diagnosis]:
     """Yield findings about this machine, made in this process."""
     yield _weights()
     yield from _caches()
-    try:
-        triton = importlib.metadata.version("triton")
-    except importlib.metadata.PackageNotFoundError:
-        triton = "missing"
-    versions = f"Python {sys.version.split()[0]}, PyTorch {torch.__version__}, Triton {triton}"
-    yield Diagnosis("program", "works", versions)
+    yield Diagnosis("program", "works", f"Python {sys.version.split()[0]}, PyTorch {torch.__version__}")
     yield _gpu()
     gpu = torch.cuda.is_available()
     device = torch.device("cuda", torch.cuda.current_device()) if gpu else torch.device("cpu")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import mean, median
 
@@ -259,8 +259,8 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
     return [Decision("cameras", f"{OTHER_FRAME}: {text}", advice)]
 
 
-def implausible(means: Tensor, cameras: Sequence[Camera]) -> list[Decision]:
-    """Return warnings about values of cameras that no real capture has.
+def implausible(means: Tensor, cameras: Sequence[Camera]) -> Iterator[Decision]:
+    """Yield warnings about values of cameras that no real capture has.
 
     Args:
         means: Positions of the scene, [N, 3].
@@ -268,17 +268,13 @@ def implausible(means: Tensor, cameras: Sequence[Camera]) -> list[Decision]:
     points = means[:: max(1, len(means) // _SAMPLE)].double()
     center = points.median(dim=0).values
     extent = max(float((points - center).norm(dim=1).quantile(_WITHIN)), _TINY)
-    lines = []
     for text, value_of, low, high in _BOUNDS:
         values = [(value_of(camera, center, extent), camera.name) for camera in cameras]
         wrong = [(value, name) for value, name in values if not low <= value <= high]
         if wrong:
             warning = f"warning: {len(wrong)} of {len(cameras)} have {text} that no real capture has"
             reason = f"{wrong[0][1]} has {wrong[0][0]:.3g}; expected {low:g} to {high:g}. Export the cameras again"
-            lines.append(
-                Decision("cameras", warning, f"{reason}, with the sizes of their images and the scene's units")
-            )
-    return lines
+            yield Decision("cameras", warning, f"{reason}, with the sizes of their images and the scene's units")
 
 
 def compare_photos(

@@ -59,13 +59,13 @@ class Measurements:
         stylizer = self._stylizer
         if not self.approximated:
             return stylizer.start(self._show)
-        with stylizer.measuring():
+        with stylizer.timed("measuring"):
             return self.exact.evaluate(stylizer.job.evaluation_views, stylizer.job.scene.sh_dc, self._show)
 
     def at_the_end(self) -> None:
         """Measure the unstylized scene and the result, and judge both."""
         if self._stylizer.job.plan.novel_views:
-            with self._stylizer.measuring():
+            with self._stylizer.timed("measuring"):
                 self._stylizer.measured = self._measured()
 
     def _measured(self) -> dict[str, Any]:

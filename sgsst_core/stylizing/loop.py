@@ -241,7 +241,7 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
             # is evaluated at the end of each round, in the same way as the initial loss.
             losses = []
             if not stylizer.step % stylizer.job.round_length:
-                with stylizer.measuring():
+                with stylizer.timed("measuring"):
                     loss = mean_loss(stylizer.evaluate(stylizer.job.evaluation_views), stylizer.job.loss.weights)
                 losses = [loss] * stylizer.job.round_length
         if has_reached(losses, target, stylizer.job.round_length):
@@ -292,10 +292,8 @@ def _by_scale(evaluation: Evaluation) -> list[float | None]:
 
 def _timed(stylizer: Stylizer, part: str, action: Callable[[Stylizer], None]) -> None:
     """Call an action between steps, and record its time as a part of the job's."""
-    started = time.perf_counter()
-    action(stylizer)
-    parts = stylizer.seconds_by_part
-    parts[part] = parts.get(part, 0.0) + time.perf_counter() - started
+    with stylizer.timed(part):
+        action(stylizer)
 
 
 def stylize(

@@ -574,16 +574,16 @@ class Stylizer:
     def start(self, show: ShowViews = show_nothing) -> Evaluation:
         """Return the loss of the unstylized scene on the evaluation views; evaluated once, at the first call."""
         if self._start is None:
-            with self.measuring():
+            with self.timed("measuring"):
                 self._start = self.evaluate(self.job.evaluation_views, self.job.views.scene.sh_dc, show)
         return self._start
 
     @contextmanager
-    def measuring(self) -> Iterator[None]:
-        """Record the time of a `with` block as measuring, separately from the steps."""
+    def timed(self, part: str) -> Iterator[None]:
+        """Record the time of a `with` block as a part of the job's, separately from the steps."""
         started, parts = time.perf_counter(), self.seconds_by_part
         yield
-        parts["measuring"] = parts.get("measuring", 0.0) + time.perf_counter() - started
+        parts[part] = parts.get(part, 0.0) + time.perf_counter() - started
 
     def drawn_background(self, index: int) -> Color | None:
         """Return the background color of a view in the next step; None for the background of the settings."""

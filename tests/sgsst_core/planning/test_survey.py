@@ -82,7 +82,7 @@ def verdict(scene: Scene, views: list[Camera]) -> str:
 )
 def test_cameras_of_no_real_capture_are_reported(change: Callable[[Camera], Camera], reported: list[str]) -> None:
     views = cameras()
-    lines = implausible(wall().means, [change(views[0]), *views[1:]])
+    lines = list(implausible(wall().means, [change(views[0]), *views[1:]]))
     assert len(lines) == len(reported)
     for line, text in zip(lines, reported, strict=True):
         assert text in line.decision
