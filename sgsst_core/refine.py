@@ -224,38 +224,33 @@ class Footprints:
     """Sizes of each Gaussian in the views, accumulated view by view in constant memory.
 
     Attributes:
-        weights: [N] float64, blend weights summed over all pixels, in pixels.
+        sums: [N, 4] float64, to be summed over ranks: blend weights of all pixels, and squared deviations by them.
         reach: [N] float64, maximum over views of the largest deviation divided by depth.
     """
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self.weights = torch.zeros(len(scene), dtype=torch.float64)
+        self.sums = torch.zeros((len(scene), 4), dtype=torch.float64)
         self.reach = torch.zeros(len(scene), dtype=torch.float64)
-        self._squares = torch.zeros((len(scene), 3), dtype=torch.float64)
 
     def add(self, camera: Camera, weights: Tensor) -> None:
         """Add a view, given weights [N] of `Rasterizer.survey` on the CPU."""
         for rows in (weights > 0).nonzero()[:, 0].split(_CHUNK):
             lengths, reach = axes_in_view(self._scene, rows, camera)
             added = weights[rows].double()
-            self.weights[rows] += added
-            self._squares[rows] += added[:, None] * lengths.square()
+            self.sums[rows, 0] += added
+            self.sums[rows, 1:] += added[:, None] * lengths.square()
             self.reach[rows] = torch.maximum(self.reach[rows], reach)
 
     @property
-    def sums(self) -> tuple[Tensor, Tensor]:
-        """Accumulated values to be reduced over ranks: [N, 4] by sum, and [N] by maximum."""
-        return torch.cat([self.weights[:, None], self._squares], dim=1), self.reach
-
-    def replace(self, sums: Tensor, reach: Tensor) -> None:
-        """Replace the accumulated values by the reduced ones of all ranks, in the format of `sums`."""
-        self.weights, self._squares, self.reach = sums[:, 0].contiguous(), sums[:, 1:].contiguous(), reach
+    def weights(self) -> Tensor:
+        """[N] float64, blend weights summed over all pixels, in pixels."""
+        return self.sums[:, 0].contiguous()
 
     @property
     def lengths(self) -> Tensor:
         """[N, 3] float64, deviation of each axis in pixels: root mean square over the views, weighted by visibility."""
-        return (self._squares / self.weights.clamp_min(1e-300)[:, None]).sqrt()
+        return (self.sums[:, 1:] / self.weights.clamp_min(1e-300)[:, None]).sqrt()
 
 
 def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

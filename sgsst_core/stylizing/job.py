@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -87,6 +87,9 @@ class JobInputs:
         about_inputs: Decisions about cameras and photos that start the plan.
         refinement: Refinement that produced the scene, for the plan to report; None if it was not refined.
         chosen: Choice of the time budget, to which `cameras` and `photos` belong (`choose_within`); None without one.
+
+    Raises:
+        CameraError: If there are no cameras.
     """
 
     scene: Scene
@@ -103,6 +106,10 @@ class JobInputs:
     refinement: Refinement | None = None
     chosen: TimeChoice | None = None
 
+    def __post_init__(self) -> None:
+        if not self.cameras:
+            raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
+
     def refined(self, refinement: Refinement | None, scene: Scene | None = None) -> JobInputs:
         """Return the inputs with their scene refined, unless `scene` is the refined scene."""
         if refinement is None:
@@ -116,18 +123,15 @@ class Phase:
     """Phase of the schedule.
 
     Attributes:
-        stage: Name of the phase: "coarse" (phase 1) or "sos" (phase 2) in every preset.
-        scale: Single scale to optimize, counted from the coarsest (0) of those with a weight; None for the SOS loss on
-            all scales.
+        stage: Name of the phase: "coarse" (phase 1, on the coarsest scale with a weight) or "sos" (phase 2, on all).
     """
 
-    stage: str
+    stage: Literal["coarse", "sos"]
     steps: int
-    scale: int | None = None
 
     def scales(self, chosen: Sequence[int]) -> list[int]:
         """Return the scales to optimize, given a view's scales with a positive weight (`chosen`), finest first."""
-        return list(chosen) if self.scale is None else [chosen[max(len(chosen) - 1 - self.scale, 0)]]
+        return list(chosen if self.stage == "sos" else chosen[-1:])
 
 
 @dataclass(frozen=True)
@@ -169,7 +173,7 @@ class StylizationJob:
     @property
     def schedule(self) -> list[Phase]:
         """The two phases of every preset."""
-        return [Phase("coarse", self.plan.steps_coarse, 0), Phase("sos", self.settings.steps_sos)]
+        return [Phase("coarse", self.plan.steps_coarse), Phase("sos", self.settings.steps_sos)]
 
     @property
     def total_steps(self) -> int:
@@ -260,11 +264,10 @@ def plan_job(
             as "preparing".
 
     Raises:
-        CameraError: If there are no cameras, or none sees a Gaussian.
+        CameraError: If no camera sees a Gaussian.
         SettingsError: If regions freeze everything visible, views lack requested scales, or the rasterizer or the
             precision does not work here.
     """
-    _check_cameras(inputs)
     timer, chosen, context = timer or Timer(), inputs.chosen, None
     settings = chosen.applied(inputs.settings) if chosen else inputs.settings
     if plan is None:
@@ -289,11 +292,6 @@ def plan_job(
     return replace(job, survey_seconds=surveyed / len(inputs.cameras))
 
 
-def _check_cameras(inputs: JobInputs) -> None:
-    if not inputs.cameras:
-        raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
-
-
 def choose_within(inputs: JobInputs, left: SecondsLeft, collectives: Collectives = ALONE) -> TimeChoice | None:
     """Choose what fits a time budget, from a survey of a few small views. Every rank must call this function.
 
@@ -306,7 +304,6 @@ def choose_within(inputs: JobInputs, left: SecondsLeft, collectives: Collectives
     settings = inputs.settings
     if not choosable(settings):
         return None
-    _check_cameras(inputs)
     fitted, weights = fit_cameras(inputs.cameras, settings), weights_for(inputs.weights, settings)
     small = [resized(each, min(_SMALL_SIDE, each.side)) for each in spread(fitted, _SMALL_VIEWS)]
     context = equip(inputs.scene, small, settings, weights, collectives, inputs.rasterizer)

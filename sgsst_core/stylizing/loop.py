@@ -219,7 +219,7 @@ def _end_requested(stylizer: Stylizer, callbacks: Callbacks, first: int, pace: _
         return "on-request"
     if callbacks.left is None:
         return None
-    coarse, left = stylizer.phase.scale is not None, callbacks.left()
+    coarse, left = stylizer.phase.stage == "coarse", callbacks.left()
     if stylizer.step == first + 1 and left > 0:
         return None
     return "within" if left <= pace.step_seconds(coarse=coarse, least=1) + pace.ending_seconds() else None

@@ -172,9 +172,8 @@ class _Refining:
             self._footprints.add(camera, weights.cpu())
 
         survey = survey_views(self._scene, context.cameras, self._rasterizer, collectives, self._show, visit)
-        sums, reach = self._footprints.sums
-        every = torch.stack(collectives.all_gather(reach)).amax(dim=0) if collectives.size > 1 else reach
-        self._footprints.replace(self._sum(sums), every)
+        self._footprints.sums = self._sum(self._footprints.sums)
+        self._footprints.reach = torch.stack(collectives.all_gather(self._footprints.reach)).amax(dim=0)
         return survey.covered
 
     def _gradient_disagreement(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
