@@ -794,10 +794,7 @@ def _about_schedule(plan: Plan, facts: Facts, settings: Settings) -> Iterator[De
             "these steps, which would reduce the same loss",
         )
         yield Decision("phase 1", skipped, reason, error=error)
-    if settings.early_stop and plan.training_background != "background":
-        reason = "losses on different backgrounds cannot be compared"
-        yield Decision("early stop", "none: all steps are run", reason)
-    elif settings.early_stop:
+    if settings.early_stop and plan.training_background == "background":
         when = (
             f"when the mean loss of {window_length(len(plan.covered))} steps is less than {MIN_FALL:.1%} below that of "
             "the same number of steps before"

@@ -493,7 +493,6 @@ class Stylizer:
         self.seconds_by_part: dict[str, float] = {}
         self.history: list[StepRecord] = []
         self.measured: dict[str, Any] = {"novel_views": None, "approximations": None}
-        self.latest: list[int] = []
         settings, views, seen = job.settings, job.views, job.plan.seen
         device = views.rasterizer.device
         # Computed once, because another processor may round differently and ranks must start with the same bits.
@@ -621,7 +620,7 @@ class Stylizer:
         self.job.loss.timer.clear()
         self._cache_visited()
         phase = self.phase
-        self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
+        views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
         before = self._queued
         self._queue(views, phase)
         if self.job.plan.precision == "float16" and self._queued is not None and is_too_large(self._queued.largest()):

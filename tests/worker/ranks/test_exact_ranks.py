@@ -226,7 +226,7 @@ def stylize_each(collectives: Collectives) -> list[dict[str, Any]]:
         exact.loss.use(FeatureNetwork(weights, job.network.layers, torch.float64))
         other = Stylizer(replace(exact, network=exact.loss.network))
         other.sh_dc = torch.nn.Parameter(torch.roll(other.sh_dc.detach(), 1, dims=0).double())
-        other.latest = views = list(range(count))
+        views = list(range(count))
         results.append(
             {
                 "losses": [record.loss for record in stylizer.history],
