@@ -242,7 +242,7 @@ def _run(
     weights = _weights(values.pop("factor", None))
     network = ROUNDED.get(values.pop("rounded", None))
     settings = make_settings("standard", **{"precision": "float32", **values})
-    with mock.patch("sgsst_core.planning.facts.FeatureNetwork", network) if network else nullcontext():
+    with mock.patch("sgsst_core.planning.plan.FeatureNetwork", network) if network else nullcontext():
         stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, regions=regions)
     pace: Pace = defaultdict(list)
     for _ in range(stylizer.job.total_steps):

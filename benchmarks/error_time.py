@@ -45,7 +45,7 @@ from sgsst_core.report.page import (
 )
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.settings import PresetName
-from sgsst_core.stylizing.steps import BEFORE_STEPS, relative_loss
+from sgsst_core.stylizing.stylizer import BEFORE_STEPS, relative_loss
 
 #: Scenes below DATA/scenes with their cameras.
 ALL_SCENES = SCENES | {"narcissus": ("statues/narcissus.sog", "orbit:24")}

@@ -42,9 +42,8 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs, prepare_job
-from sgsst_core.stylizing.planner import plan_job
-from sgsst_core.stylizing.steps import mean_loss
+from sgsst_core.stylizing.job import JobInputs, plan_job, prepare_job
+from sgsst_core.stylizing.stylizer import mean_loss
 
 #: Components that can be left out without changing the result.
 EVERYTHING = ("unseen", "uncovered", "activations", "content")

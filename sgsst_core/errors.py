@@ -17,107 +17,77 @@ class SgsstError(Exception):
     #: Stable identifier for programs; messages are for people and may change.
     code = "sgsst-error"
 
+    def __init_subclass__(cls, code: str | None = None) -> None:
+        if code is not None:
+            cls.code = code
 
-class InvalidInputError(SgsstError):
+
+class InvalidInputError(SgsstError, code="invalid-input"):
     """User input that cannot be used."""
 
-    code = "invalid-input"
 
-
-class SceneError(InvalidInputError):
+class SceneError(InvalidInputError, code="invalid-scene"):
     """Unusable 3DGS scene: missing, truncated, not a 3DGS scene, non-finite values, or empty."""
 
-    code = "invalid-scene"
 
-
-class CameraError(InvalidInputError):
+class CameraError(InvalidInputError, code="invalid-cameras"):
     """Unusable cameras: unknown format, distorted model, or no overlap with the scene."""
 
-    code = "invalid-cameras"
 
-
-class ImageError(InvalidInputError):
+class ImageError(InvalidInputError, code="invalid-image"):
     """Unusable style image or photo: not an image, too large, or missing."""
 
-    code = "invalid-image"
 
-
-class MaskError(InvalidInputError):
+class MaskError(InvalidInputError, code="invalid-mask"):
     """Unusable mask of a scene's Gaussians: unreadable, of another length, or with other values than flags."""
 
-    code = "invalid-mask"
 
-
-class SettingsError(InvalidInputError):
+class SettingsError(InvalidInputError, code="invalid-settings"):
     """Setting that is out of range or contradicts another one."""
 
-    code = "invalid-settings"
 
-
-class OutputError(InvalidInputError):
+class OutputError(InvalidInputError, code="invalid-output"):
     """Output location that cannot be written."""
 
-    code = "invalid-output"
 
-
-class WeightsError(InvalidInputError):
+class WeightsError(InvalidInputError, code="invalid-weights"):
     """Weights of the feature network that are missing, corrupt or of the wrong shape."""
 
-    code = "invalid-weights"
 
-
-class SceneTooLargeError(InvalidInputError):
+class SceneTooLargeError(InvalidInputError, code="scene-too-large"):
     """Scene that does not fit in the memory of a machine or of its GPU."""
 
-    code = "scene-too-large"
 
-
-class CheckpointError(InvalidInputError):
+class CheckpointError(InvalidInputError, code="invalid-checkpoint"):
     """Checkpoint that is missing, corrupt or from another job."""
 
-    code = "invalid-checkpoint"
 
-
-class TooManyIntersectionsError(SgsstError):
+class TooManyIntersectionsError(SgsstError, code="too-many-intersections"):
     """View with more pairs of Gaussian and raster tile than the rasterizer can index."""
 
-    code = "too-many-intersections"
 
-
-class RanksFailedError(SgsstError):
+class RanksFailedError(SgsstError, code="workers-failed"):
     """Failure of a job's workers: they were lost too often, or an error ended one of them."""
 
-    code = "workers-failed"
 
-
-class RanksDriftedError(SgsstError):
+class RanksDriftedError(SgsstError, code="ranks-drifted"):
     """Different colors on ranks that must agree: one machine computes incorrectly, or rounds differently."""
 
-    code = "ranks-drifted"
 
-
-class DivergedError(SgsstError):
+class DivergedError(SgsstError, code="diverged"):
     """Colors or gradients beyond the range that the optimizer can handle."""
 
-    code = "diverged"
 
-
-class DeviceMemoryError(SgsstError):
+class DeviceMemoryError(SgsstError, code="gpu-memory"):
     """GPU without enough free memory for a step, even with half of the activations."""
 
-    code = "gpu-memory"
 
-
-class InfrastructureError(SgsstError):
+class InfrastructureError(SgsstError, code="infrastructure"):
     """Failure of a machine, a network or a file store, independent of the user's input."""
 
-    code = "infrastructure"
 
-
-class ClusterAwayError(RanksFailedError, InfrastructureError):
+class ClusterAwayError(RanksFailedError, InfrastructureError, code="workers-failed"):
     """Cluster that is unavailable, or that has no capacity for even a single worker."""
-
-    code = "workers-failed"
 
 
 @contextmanager

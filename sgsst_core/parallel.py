@@ -18,7 +18,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -141,51 +140,6 @@ class Collectives:
 
 
 ALONE = Collectives()
-
-
-#: If a view shows more than this fraction of all Gaussians, the whole gradient is sent: gathering and scattering values
-#: would take more time than sending fewer values saves.
-DENSE_FRACTION = 0.7
-
-
-class ShownGaussians:
-    """Set of Gaussians, one bit each.
-
-    Each view's set is stored for the whole job: 4 million Gaussians take 0.5 MB, while their indices would take up to
-    32 MB.
-
-    Args:
-        mask: [N] bool, on any device; the bits are stored on the same device.
-    """
-
-    def __init__(self, mask: Tensor) -> None:
-        self.total = len(mask)
-        self.count = int(mask.sum())
-        whole = torch.nn.functional.pad(mask.to(torch.uint8), (0, -self.total % 8))
-        self._bits = (whole.view(-1, 8) << _bit_positions(mask.device)).sum(dim=1, dtype=torch.uint8)
-
-    @staticmethod
-    def nbytes(gaussians: int) -> int:
-        """Return the size in bytes of a set, for a scene with this many Gaussians."""
-        return -(-gaussians // 8)
-
-    @property
-    def sparse(self) -> bool:
-        """Whether only the gradients of Gaussians in the set are sent, instead of all gradients."""
-        return self.count <= DENSE_FRACTION * self.total
-
-    def indices(self) -> Tensor:
-        """Return the indices [count] int64 in ascending order, without synchronizing with a GPU."""
-        if self._bits.device.type == "cpu":  # on a CPU, NumPy is an order of magnitude faster
-            flags = np.unpackbits(self._bits.numpy(), count=self.total, bitorder="little")
-            return torch.from_numpy(np.flatnonzero(flags))
-        mask = (self._bits[:, None] >> _bit_positions(self._bits.device)).bitwise_and_(1).view(-1)[: self.total]
-        return torch.nonzero_static(mask, size=self.count)[:, 0]
-
-
-def _bit_positions(device: torch.device) -> Tensor:
-    """Return the positions of the bits in a byte."""
-    return torch.arange(8, dtype=torch.uint8, device=device)
 
 
 #: Steps between two checks that all ranks have the same colors.

@@ -6,7 +6,7 @@ x_i. K determines r, and the weights follow from
 
     sum_i w_i x_i = 0,    (s / r)^2 + sum_i w_i x_i^2 = s^2,
 
-so the mixture of the children has the parent's mean and variance. The spacing is the one at which the mixture is
+so the mixture of the children has the parent's mean and variance. The Gaussian function ends where the mixture is
 closest to the parent in L2: within 3 % for every K. (K = 2 is not used: with two children, the mixture is closest if
 they are hardly smaller than the parent.) Axes are split independently, so the mixture of all children has the parent's
 mean and covariance.
@@ -47,29 +47,14 @@ MAX_PIECES = 32
 #: K pieces are smaller than the parent by the factor r = _SLOPE K + _START, for which the mixture is within 3 % of the
 #: parent.
 _SLOPE, _START = 0.35, 0.33
-#: Candidate spacings of children, in units of their deviation.
-_DISTANCES = np.linspace(1.0, 2.6, 33)
-#: Number of children whose geometry is computed at a time; takes some tens of megabytes in float64.
-_ROWS = 1 << 18
+#: The weights of K pieces end at _END - _FEWER / K deviations of the Gaussian function; fitted to the best ends.
+_END, _FEWER = 2.85, 4.2
+#: Number of Gaussians that are split at a time; their children take some tens of megabytes in float64.
+_PARENTS = 1 << 10
 #: Limits of log scale and position. Gaussians beyond them are not split, because their children could leave the range
 #: of float32.
 _LARGEST_LOG_SCALE, _SMALLEST_LOG_SCALE = 60.0, -60.0
 _FARTHEST = 1e30
-
-
-@dataclass(frozen=True)
-class AxisSplit:
-    """Division of one axis into pieces, for a parent with deviation 1.
-
-    Attributes:
-        ratio: Factor by which children are smaller.
-        offsets: [K] float64, positions of the children, ascending and symmetric about 0.
-        weights: [K] float64 with sum 1.
-    """
-
-    ratio: float
-    offsets: NDArray[np.float64]
-    weights: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -144,13 +129,8 @@ def split(scene: Scene, pieces: Tensor) -> Scene:
         raise ValueError("Gaussians of extreme size or position cannot be split")
     first = counts.cumsum(0) - counts
     result = scene.subset(torch.repeat_interleave(counts))
-    ends = counts[parents].cumsum(0)
-    start = 0
-    while start < len(parents):
-        before = int(ends[start - 1]) if start else 0
-        stop = max(int(torch.searchsorted(ends, before + _ROWS, right=True)), start + 1)
-        _place_children(scene, pieces, parents[start:stop], counts, first, result)
-        start = stop
+    for some in parents.split(_PARENTS):
+        _place_children(scene, pieces, some, counts, first, result)
     return result
 
 
@@ -172,51 +152,16 @@ def ratio_of(number: int) -> float:
     return 1.0 if number == 1 else _SLOPE * number + _START
 
 
-@functools.cache
-def split_axis(number: int) -> AxisSplit:
-    """Return the division of an axis into `number` pieces, which is 1, or 3 to `MAX_PIECES`."""
-    if number == 1:
-        return AxisSplit(1.0, np.zeros(1), np.ones(1))
-    ratio = ratio_of(number)
-    divisions = [
-        division for distance in _DISTANCES if (division := _split_axis_at(number, ratio, distance / ratio)) is not None
-    ]
-    return min(divisions, key=mixture_error)
+def split_axis(number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Divide an axis of a parent with deviation 1 into `number` pieces, which is 1, or 3 to `MAX_PIECES`.
 
-
-def mixture_error(division: AxisSplit) -> float:
-    """Return the L2 distance of the children's mixture from the normal density, relative to that density's norm.
-
-    It is computed in closed form.
+    Returns:
+        Positions of the children [K] float64, ascending and symmetric about 0, and their weights [K] with sum 1.
     """
-    child, both = 1 / division.ratio**2, 1 + 1 / division.ratio**2
-    apart = division.offsets[:, None] - division.offsets
-    mixed = division.weights @ _normal(apart, 2 * child) @ division.weights
-    crossed = division.weights @ _normal(division.offsets, both)
-    parent = _normal(np.zeros(1), 2.0)[0]
-    return float(np.sqrt(max(mixed - 2 * crossed + parent, 0.0) / parent))
-
-
-def _normal(offsets: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
-    density: NDArray[np.float64] = np.exp(-(offsets**2) / (2 * variance)) / np.sqrt(2 * np.pi * variance)
-    return density
-
-
-def _split_axis_at(number: int, ratio: float, distance: float) -> AxisSplit | None:
-    """Return the division with spacing `distance` that preserves the parent's variance; None if there is none."""
-    offsets = np.linspace(-1.0, 1.0, number) * ((number - 1) / 2 * distance)
-    squares, wanted = offsets**2, 1 - 1 / ratio**2
-    if not squares.min() < wanted < squares.mean():
-        return None
-    low, high = 0.0, 700 / squares.max()  # the variance decreases from that of equal weights
-    for _ in range(100):
-        middle = (low + high) / 2
-        weights = np.exp(-middle * (squares - squares.min()))
-        weights = weights / weights.sum()
-        low, high = (middle, high) if weights @ squares > wanted else (low, middle)
-    if abs(weights @ squares - wanted) > 1e-12:  # the solution was outside the bracket
-        return None
-    return AxisSplit(ratio, offsets, weights)
+    ratio, positions = ratio_of(number), np.linspace(-1.0, 1.0, number) * (_END - _FEWER / number)
+    weights = np.exp(-(positions**2) / 2)
+    weights = weights / weights.sum()
+    return positions * np.sqrt((1 - 1 / ratio**2) / (weights @ positions**2)), weights
 
 
 @functools.cache
@@ -225,10 +170,10 @@ def _tables() -> tuple[Tensor, Tensor, Tensor]:
     offsets, log_weights = torch.zeros(2, MAX_PIECES + 1, MAX_PIECES, dtype=torch.float64)
     ratios = torch.zeros(MAX_PIECES + 1, dtype=torch.float64)
     for number in (1, *range(3, MAX_PIECES + 1)):
-        division = split_axis(number)
-        offsets[number, :number] = torch.from_numpy(division.offsets)
-        log_weights[number, :number] = torch.from_numpy(np.log(division.weights * division.ratio))
-        ratios[number] = np.log(division.ratio)
+        positions, weights = split_axis(number)
+        offsets[number, :number] = torch.from_numpy(positions)
+        log_weights[number, :number] = torch.from_numpy(np.log(weights * ratio_of(number)))
+        ratios[number] = np.log(ratio_of(number))
     return offsets, log_weights, ratios
 
 
@@ -279,38 +224,33 @@ class Footprints:
     """Sizes of each Gaussian in the views, accumulated view by view in constant memory.
 
     Attributes:
-        weights: [N] float64, blend weights summed over all pixels, in pixels.
+        sums: [N, 4] float64, to be summed over ranks: blend weights of all pixels, and squared deviations by them.
         reach: [N] float64, maximum over views of the largest deviation divided by depth.
     """
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self.weights = torch.zeros(len(scene), dtype=torch.float64)
+        self.sums = torch.zeros((len(scene), 4), dtype=torch.float64)
         self.reach = torch.zeros(len(scene), dtype=torch.float64)
-        self._squares = torch.zeros((len(scene), 3), dtype=torch.float64)
 
     def add(self, camera: Camera, weights: Tensor) -> None:
         """Add a view, given weights [N] of `Rasterizer.survey` on the CPU."""
         for rows in (weights > 0).nonzero()[:, 0].split(_CHUNK):
             lengths, reach = axes_in_view(self._scene, rows, camera)
             added = weights[rows].double()
-            self.weights[rows] += added
-            self._squares[rows] += added[:, None] * lengths.square()
+            self.sums[rows, 0] += added
+            self.sums[rows, 1:] += added[:, None] * lengths.square()
             self.reach[rows] = torch.maximum(self.reach[rows], reach)
 
     @property
-    def sums(self) -> tuple[Tensor, Tensor]:
-        """Accumulated values to be reduced over ranks: [N, 4] by sum, and [N] by maximum."""
-        return torch.cat([self.weights[:, None], self._squares], dim=1), self.reach
-
-    def replace(self, sums: Tensor, reach: Tensor) -> None:
-        """Replace the accumulated values by the reduced ones of all ranks, in the format of `sums`."""
-        self.weights, self._squares, self.reach = sums[:, 0].contiguous(), sums[:, 1:].contiguous(), reach
+    def weights(self) -> Tensor:
+        """[N] float64, blend weights summed over all pixels, in pixels."""
+        return self.sums[:, 0].contiguous()
 
     @property
     def lengths(self) -> Tensor:
         """[N, 3] float64, deviation of each axis in pixels: root mean square over the views, weighted by visibility."""
-        return (self._squares / self.weights.clamp_min(1e-300)[:, None]).sqrt()
+        return (self.sums[:, 1:] / self.weights.clamp_min(1e-300)[:, None]).sqrt()
 
 
 def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

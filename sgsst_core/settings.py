@@ -203,16 +203,6 @@ def parse_strength(text: str) -> float:
         raise ValueError(f"{text!r} is not a weight. Give a number or one of {', '.join(STRENGTHS)}.") from None
 
 
-def parse_growth(text: str) -> float | str:
-    """Return the factor of a refinement, or "auto"."""
-    if text.lower() == "auto":
-        return "auto"
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"{text!r} is not a factor. Give a number or auto.") from None
-
-
 def parse_weights(text: str) -> tuple[float, ...]:
     """Return weights of scales from "1,0.5,0,1"."""
     try:
@@ -434,7 +424,7 @@ class Settings(BaseModel):
         description="In phase 2, evaluate a scale other than the coarsest in one of N visits of a view that evaluate "
         "the next coarser scale, drawn at random, with N times the weight; 1 evaluates all scales in every step.",
     )
-    refine: Annotated[RefineFactor | Literal["auto"], Option(unit="factor", metavar="N", parse=parse_growth)] = Field(
+    refine: Annotated[RefineFactor | Literal["auto"], Option(unit="factor", metavar="N")] = Field(
         1.0,
         description="Split Gaussians that are large on screen, for finer strokes: up to N times as many in total "
         "(1 = off); auto: only those too large for the strokes of the finest scale, up to twice as many in total.",

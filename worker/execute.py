@@ -35,8 +35,7 @@ from sgsst_core.files.scene_file import (
     write_stylized,
 )
 from sgsst_core.parallel import ALONE, Collectives
-from sgsst_core.planning.facts import common_device, rasterizer_problem
-from sgsst_core.planning.plan import LOSS_VIEWS, Plan
+from sgsst_core.planning.plan import LOSS_VIEWS, Plan, common_device, rasterizer_problem
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice
 from sgsst_core.progress import Progress
@@ -49,12 +48,19 @@ from sgsst_core.scene.camera import resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, load_plan, save_checkpoint, save_plan, versions
-from sgsst_core.stylizing.job import JobInputs, StylizationJob
+from sgsst_core.stylizing.job import JobInputs, StylizationJob, choose_within, estimate, plan_job
 from sgsst_core.stylizing.loop import Callbacks, Stopped, run
-from sgsst_core.stylizing.planner import choose_within, estimate, plan_job
 from sgsst_core.stylizing.refining import refine
-from sgsst_core.stylizing.steps import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
-from sgsst_core.stylizing.stylizer import Stylizer, render_first_view, transferred_colors
+from sgsst_core.stylizing.stylizer import (
+    Evaluation,
+    Stylizer,
+    mean_loss,
+    on_scales_of,
+    render_first_view,
+    round_evaluation,
+    show_nothing,
+    transferred_colors,
+)
 from worker.inputs import Inputs, fingerprint_of, read_inputs, same_weights, together
 from worker.job import CONTINUABLE, JobSpec, Outputs, Result, Resume, check_request
 from worker.run import Listener, WorkerOptions
@@ -549,7 +555,9 @@ def _write_reports(
         if job.request.colors and _has_rows_of_file(job) and not attenuated:  # only f_dc changes
             write_colors(outputs.colors, stylizer.stylized())
         near, survey = stylizer.job.settings.near, stylizer.job.plan.survey
-        findings = findings_of(job.scene_file, stylizer.job.views.cameras, stylizer.job.style, near=near, survey=survey)
+        findings = findings_of(
+            job.scene_file, stylizer.job.views.cameras, stylizer.job.styles.own, near=near, survey=survey
+        )
         _count_remaining(job, "writing")
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
         report |= seconds_json(stylizer, job.seconds)

@@ -52,8 +52,7 @@ from sgsst_core.files.images import (
 from sgsst_core.files.scene_file import SceneFile, read_property, read_scene
 from sgsst_core.orbit import Orbit, OrbitRequest, find_subject, find_up, make_orbit
 from sgsst_core.parallel import ALONE, Collectives
-from sgsst_core.planning.facts import check_scales
-from sgsst_core.planning.plan import OPTIMIZER_BYTES
+from sgsst_core.planning.plan import OPTIMIZER_BYTES, check_scales
 from sgsst_core.planning.survey import (
     compare_photos,
     frame_warnings,
@@ -83,7 +82,7 @@ from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
-from sgsst_core.stylizing.job import check_style_size
+from sgsst_core.stylizing.styles import check_style_size
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import REST, RegionRequest, Selection, StyleFile
 

@@ -48,8 +48,7 @@ from sgsst_core.files.formats import (
     listed,
     result_name,
 )
-from sgsst_core.progress import Progress, duration
-from sgsst_core.stylizing.progress_bar import live_bar, set_total
+from sgsst_core.progress import Progress, duration, live_bar, set_total
 from worker.job import check_file, check_folder, check_is_not_input
 from worker.options import ESSENTIALS, RegionOptions, parse_styles, path_or_url, region_requests, split_weight
 

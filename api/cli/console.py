@@ -101,7 +101,7 @@ def transfer_bar(console: Console, description: str) -> Iterator[Callable[[int, 
     """Show the progress of a transfer; yield a function that receives the transferred and the total bytes."""
     from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
 
-    from sgsst_core.stylizing.progress_bar import live_bar
+    from sgsst_core.progress import live_bar
 
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with live_bar(console, *columns) as bar:

@@ -35,8 +35,7 @@ from api.cli.options import (
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
-from sgsst_core.progress import clock, duration
-from sgsst_core.stylizing.progress_bar import job_bar, live_bar
+from sgsst_core.progress import clock, duration, job_bar, live_bar
 from worker.job import JobSpec, Outputs, SceneRequest, check_suffix
 from worker.options import (
     ESSENTIALS,
@@ -73,9 +72,10 @@ def plan(
 ) -> None:
     """Show what a stylization would skip and why, and what a step would cost."""
     from api.cli.scene_tools import make_plan
+    from sgsst_core.compiled import compilations_reported
 
     request = inputs.request(options, out)
-    with job_bar(error_console) as bar:
+    with job_bar(error_console) as bar, compilations_reported(bar.show_compiling):
         plan = make_plan(request, bar.show, sheet, context.obj.started)
     out_console.print(_decisions_table(plan["decisions"]))
     expected = plan["prediction"]

@@ -29,8 +29,7 @@ from api.cli.machine_commands import fetch
 from api.cli.options import JobArguments, file_to_write, folder_to_write, with_arguments, with_options
 from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
-from sgsst_core.progress import clock
-from sgsst_core.stylizing.progress_bar import job_bar
+from sgsst_core.progress import clock, job_bar
 from worker.job import JobSpec, Outputs, Result, check_request
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 from worker.processes import STOP_SIGNALS
@@ -119,6 +118,9 @@ def run_job(
         if workers is not None:  # the processes of ranks are ended in order even before the first step
             stack.enter_context(stop.on_signal(_announce_stop))
         bar = stack.enter_context(job_bar(error_console))
+        from sgsst_core.compiled import compilations_reported  # takes seconds to import
+
+        stack.enter_context(compilations_reported(bar.show_compiling))
 
         def prepared(summary: Prepared) -> None:
             if workers is None:

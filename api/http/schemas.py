@@ -384,9 +384,9 @@ class PlanView(BaseModel):
             "version": 1,
             "decisions": [
                 {
-                    "item": "network layers",
-                    "decision": "none behind relu5_1, the deepest one used",
-                    "reason": "the loss reads no deeper one",
+                    "item": "partition",
+                    "decision": "none: the network takes each view as a whole",
+                    "reason": "tiles are as large as fit in the 1.6 GB for activations",
                     "seconds": None,
                     "bytes": None,
                     "error": "none",

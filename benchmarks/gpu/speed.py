@@ -25,9 +25,9 @@ from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PlannedPrecision, make_settings
+from sgsst_core.stylizing.job import estimate
 from sgsst_core.stylizing.loop import Callbacks
 from sgsst_core.stylizing.loop import run as run_steps
-from sgsst_core.stylizing.planner import estimate
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Warm-up steps, in which views are prepared and libraries choose their algorithms.

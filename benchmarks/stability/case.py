@@ -25,15 +25,14 @@ from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeig
 from sgsst_core.features.vgg import Activations, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.parallel import ALONE, Collectives
-from sgsst_core.planning.facts import DTYPES
+from sgsst_core.planning.plan import DTYPES
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.settings import PlannedPrecision, Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs
-from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.job import JobInputs, plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 

@@ -29,8 +29,8 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene, unit_rotations
 from sgsst_core.style import Style
-from sgsst_core.stylizing.color_transfer import in_colors_of
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.styles import in_colors_of
 from sgsst_core.stylizing.stylizer import ADAM_EPS
 
 #: Input, result of the published formula, and result of this program, [H, W, 3] or [H, W] each.

@@ -56,8 +56,8 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.job import in_bfloat16
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.steps import mean_loss
-from sgsst_core.stylizing.stylizer import Stylizer, constrained
+from sgsst_core.stylizing.styles import constrained
+from sgsst_core.stylizing.stylizer import Stylizer, mean_loss
 from worker.ranks.process_group import process_group
 
 #: Relative error bound of loss and pixel gradient of the last image against float64.
@@ -294,7 +294,7 @@ def _evaluated(
             style_scale=settings.style_scale,
             scales=job.job.loss.weights,
         )
-        return evaluate(loss, image, job.job.style, content, coverage)
+        return evaluate(loss, image, job.job.styles.own, content, coverage)
 
     return evaluated
 

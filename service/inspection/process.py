@@ -51,7 +51,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import STARRY_NIGHT
 from sgsst_core.stylizing.checkpoint import versions
-from sgsst_core.stylizing.planner import estimate
+from sgsst_core.stylizing.job import estimate
 from worker.derived import VideoRequest, blend, convert, render_video, write_page, write_poster
 from worker.execute import dry_run
 from worker.inputs import Inputs, choose_axes, cropped, errors_of, orbit_request, read_inputs, read_job_capture

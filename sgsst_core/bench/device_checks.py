@@ -6,7 +6,6 @@ first job on a machine compiles them, and so does each of the service's confined
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
 import os
 import shutil
@@ -19,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.bench.doctor import Diagnosis, State
+from sgsst_core.bench.doctor import Diagnosis
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import kernel_folders
 from sgsst_core.errors import OutputError
@@ -30,8 +29,7 @@ from sgsst_core.features.weight_files import cache_folder, damage_of
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel import ALONE
-from sgsst_core.planning.facts import describe_machine, gpu_problems
-from sgsst_core.planning.plan import choose_precision
+from sgsst_core.planning.plan import choose_precision, describe_machine, gpu_problems
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer, rasterizer_for
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
@@ -57,12 +55,7 @@ def findings() -> Iterator[Diagnosis]:
     """Yield findings about this machine, made in this process."""
     yield _weights()
     yield from _caches()
-    try:
-        triton = importlib.metadata.version("triton")
-    except importlib.metadata.PackageNotFoundError:
-        triton = "missing"
-    versions = f"Python {sys.version.split()[0]}, PyTorch {torch.__version__}, Triton {triton}"
-    yield Diagnosis("program", "works", versions)
+    yield Diagnosis("program", "works", f"Python {sys.version.split()[0]}, PyTorch {torch.__version__}")
     yield _gpu()
     gpu = torch.cuda.is_available()
     device = torch.device("cuda", torch.cuda.current_device()) if gpu else torch.device("cpu")
@@ -77,38 +70,30 @@ def findings() -> Iterator[Diagnosis]:
 
 def _weights() -> Diagnosis:
     installed = {entry.name: entry.path for entry in list_network_weights() if entry.path is not None}
-    for name, path in installed.items():
-        if damage := damage_of(path, name):
-            return Diagnosis("weights", "problem", damage)
+    damages = [damage for name, path in installed.items() if (damage := damage_of(path, name))]
     networks = [name for name in installed if name in ("vgg19", "vgg16")]
-    if not networks:
-        text = (
-            "no network is installed. Run `sgsst weights fetch vgg19` (575 MB) or `sgsst weights fetch vgg16` (64 MB)."
-        )
-        return Diagnosis("weights", "problem", text)
+    if damages or not networks:
+        fetch = "Run `sgsst weights fetch vgg19` (575 MB) or `sgsst weights fetch vgg16` (64 MB)."
+        return Diagnosis("weights", "problem", damages[0] if damages else f"no network is installed. {fetch}")
     return Diagnosis("weights", "works", f"{' and '.join(networks)} installed and undamaged")
 
 
 def _caches() -> Iterator[Diagnosis]:
-    """Yield a finding for each folder that cannot be written; if all can be, a single finding."""
+    """Yield a finding for each folder that cannot be written."""
     triton = Path(os.environ.get("TRITON_CACHE_DIR") or Path(os.environ.get("TRITON_HOME") or Path.home()) / ".triton")
     variables = {
         cache_folder(): "SGSST_CACHE",
         triton: "TRITON_CACHE_DIR",
         **dict.fromkeys(kernel_folders(), "NUMBA_CACHE_DIR"),
     }
-    unwritable = False
     for folder, variable in variables.items():
         try:
             ensure_writable_folder(folder)
         except (OutputError, OSError):
-            unwritable = True
             text = f"{folder} cannot be written, so every process compiles or downloads again. Set {variable}."
             yield Diagnosis("cache", "warning", text)
     if not kernel_folders():
         yield Diagnosis("cache", "warning", "no folder for compiled kernels can be written. Set NUMBA_CACHE_DIR.")
-    elif not unwritable:
-        yield Diagnosis("cache", "works", f"{cache_folder()} and the folders of compiled kernels can be written")
 
 
 def _gpu() -> Diagnosis:
@@ -133,8 +118,7 @@ def _gpu() -> Diagnosis:
 
 def _memory(device: torch.device) -> Diagnosis:
     gigabytes = default_memory_limit(device) / 1e9
-    where = "of the GPU's" if device.type == "cuda" else "of"
-    text = f"jobs plan with {gigabytes:.1f} GB {where} memory"
+    text = f"jobs plan with {gigabytes:.1f} GB of {'the GPU' if device.type == 'cuda' else 'the machine'}'s memory"
     if gigabytes >= _LITTLE_MEMORY:
         return Diagnosis("memory", "works", text)
     return Diagnosis("memory", "warning", f"{text}, enough for small views only. End other programs.")
@@ -145,11 +129,9 @@ def _rasterizer(*, gpu: bool) -> tuple[str, Diagnosis]:
     problems = gpu_problems(ALONE) if gpu else {}
     name = rasterizer_for("cuda" if gpu else "cpu", problems)
     texts = [f"{RASTERIZERS[each].title} cannot be used: {problem}" for each, problem in problems.items()]
-    title = f"{RASTERIZERS[name].title} works here"
-    state: State = "works"
-    if not RASTERIZERS[name].on_gpu:
-        title, state = "views are rendered on the CPU", "warning" if gpu else "works"
-    return name, Diagnosis("rasterizer", state, "; ".join([title, *texts]))
+    used = RASTERIZERS[name]
+    title = f"{used.title} works here" if used.on_gpu else "views are rendered on the CPU"
+    return name, Diagnosis("rasterizer", "warning" if gpu and not used.on_gpu else "works", "; ".join([title, *texts]))
 
 
 def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:

@@ -11,13 +11,11 @@ time if it reaches some loss sooner than all others, and on that of quality if n
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -47,12 +45,13 @@ from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, Settings, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.color_transfer import warm_start
-from sgsst_core.stylizing.steps import relative_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.styles import warm_start
+from sgsst_core.stylizing.stylizer import Stylizer, relative_loss
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+T = TypeVar("T")
 
 #: Number of slices of the time budget. Variants take turns slice by slice, so that a temporary slowdown of the machine
 #: affects all of them.
@@ -62,7 +61,8 @@ MOMENTS = (1, 2, 4, 8, 16, 32)
 #: Markers of curves. Their number (7) and the number of colors (6) have no common divisor, so up to 42 variants have
 #: distinct combinations of marker and color.
 _MARKERS = "osD^vP*"
-#: Measures of the judgment that the plot shows, with their titles.
+#: Title of the panel of the mean loss; measures of the judgment that the plot shows, with their titles.
+_MEAN = "mean of the scales"
 _JUDGED = {"style": "distance from the style (AlexNet)", "color_distance": "color distance"}
 #: Names of the outcomes that are judged for comparison with the variants.
 UNSTYLIZED, TRANSFER = "unstylized", "transfer"
@@ -91,14 +91,17 @@ def _of_preset(preset: PresetName) -> dict[str, Any]:
     return {name: value for name, (usual, value) in pairs.items() if value != usual}
 
 
-PAPER_RATE = {"learning_rate": 2.5e-3, "learning_rate_end": 2.5e-3, "clamp_aware_gradient": False}
 VARIANTS = {
     variant.name: variant
     for variant in (
         Variant("standard", "all scales (SOS), the finer ones in some visits of a view; the standard preset"),
         Variant("preview", "the preview preset: views of at most 640 pixels", _of_preset("preview")),
         Variant("paper", "the paper preset: published schedule, rate and start", _of_preset("paper")),
-        Variant("paper-rate", "the same with the paper's constant learning rate and clamp", PAPER_RATE),
+        Variant(
+            "paper-rate",
+            "standard with the paper's constant learning rate and clamp",
+            {"learning_rate": 2.5e-3, "learning_rate_end": 2.5e-3, "clamp_aware_gradient": False},
+        ),
         Variant("all-scales", "all scales in every step", {"scale_sampling": 1}),
         Variant("coarse-only", "the coarsest scale alone", {"steps_coarse": 300, "steps_sos": 0}),
         Variant("one-scale", "the paper's loss at full size alone", {"scales": (1.0,)}),
@@ -247,21 +250,20 @@ def _prepared(
     return Curve(variant, [], preparation=time.perf_counter() - started), stylizer
 
 
-def pareto_front(curves: Sequence[Curve]) -> list[tuple[str, Point]]:
-    """Return the points that no other point dominates in seconds and loss, ordered by seconds."""
-    front: list[tuple[str, Point]] = []
-    points = [
-        (curve.variant.name, point, point.relative)
-        for curve in curves
-        for point in curve.points
-        if point.relative is not None
-    ]
-    least = math.inf
-    for name, point, relative in sorted(points, key=lambda item: (item[1].seconds, item[2])):
-        if relative < least:
-            front.append((name, point))
-            least = relative
+def undominated(items: Iterable[T], measures: Callable[[T], tuple[float, float]]) -> list[T]:
+    """Return the items that no other one dominates in both measures, ordered by the first; lower is better."""
+    front: list[T] = []
+    for item in sorted(items, key=measures):
+        if not front or measures(item)[1] < measures(front[-1])[1]:
+            front.append(item)
     return front
+
+
+def pareto_front(curves: Sequence[Curve]) -> list[tuple[str, Point, float]]:
+    """Return the points that no other point dominates in seconds and loss, ordered by seconds, with their losses."""
+    points = [(curve.variant.name, point, point.relative) for curve in curves for point in curve.points]
+    known = [(name, point, relative) for name, point, relative in points if relative is not None]
+    return undominated(known, lambda item: (item[1].seconds, item[2]))
 
 
 def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
@@ -277,8 +279,8 @@ def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
             for curve in curves
         },
         "pareto_front": [
-            {"variant": name, "seconds": round(point.seconds, 3), "relative": point.relative}
-            for name, point in pareto_front(curves)
+            {"variant": name, "seconds": round(point.seconds, 3), "relative": relative}
+            for name, point, relative in pareto_front(curves)
         ],
     }
 
@@ -293,36 +295,32 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
     """
     shown = [curve for curve in curves if curve.points]
     points = [point for curve in shown for point in curve.points]
-    panels: list[tuple[str, Callable[[Point], float | None]]] = [("mean of the scales", lambda point: point.relative)]
-    for scale in sorted({scale for point in points for scale in point.by_scale}):
-        panels += [(scale_name(scale), partial(_loss_of, scale))]
-    losses = len(panels)
-    if any(point.judgment for point in points):
-        panels += [(what, partial(_judged, name)) for name, what in _JUDGED.items()]
-    with png_chart(path, (5.2 * len(panels), 4.8)) as figure:
-        every = figure.subplots(1, len(panels), squeeze=False)[0]
-        drawn = [_draw_curves(axes, shown, *panel) for axes, panel in zip(every, panels, strict=True)]
+    titles = list(dict.fromkeys([_MEAN, *(panel for point in points for panel in _measures(point))]))
+    losses = len([panel for panel in titles if panel not in _JUDGED.values()])
+    with png_chart(path, (5.2 * len(titles), 4.8)) as figure:
+        every = figure.subplots(1, len(titles), squeeze=False)[0]
+        drawn = [_draw_curves(axes, shown, panel) for axes, panel in zip(every, titles, strict=True)]
         for index, axes in enumerate(every):
             set_log_y(axes, drawn[:losses] if index < losses else [drawn[index]])
-        front = [point for _, point in pareto_front(shown)]
-        every[0].plot([p.seconds for p in front], [p.relative for p in front], "--", color=INK, lw=2.5, alpha=0.35)
+        front = pareto_front(shown)
+        seconds, relative = [point.seconds for _, point, _ in front], [loss for *_, loss in front]
+        every[0].plot(seconds, relative, "--", color=INK, lw=2.5, alpha=0.35)
         every[0].set_ylabel(RELATIVE_LOSS)
         draw_legend(figure, in_row=7)
         figure.suptitle(f"{title} (dashed: Pareto front)")
 
 
-def _loss_of(scale: int, point: Point) -> float | None:
-    return point.by_scale.get(scale)
+def _measures(point: Point) -> dict[str, float | None]:
+    """Return what the plot shows of a point, by the title of its panel: losses first, then judgments."""
+    scales = {scale_name(scale): loss for scale, loss in sorted(point.by_scale.items())}
+    judged = {title: getattr(point.judgment, name) for name, title in _JUDGED.items()} if point.judgment else {}
+    return {_MEAN: point.relative, **scales, **judged}
 
 
-def _judged(name: str, point: Point) -> float | None:
-    return getattr(point.judgment, name, None)
-
-
-def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str, value: Callable[[Point], float | None]) -> Floats:
-    """Draw a value of points against seconds with one line per curve; return the drawn values."""
+def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str) -> Floats:
+    """Draw a measure of points against seconds with one line per curve; return the drawn values."""
     seconds = [column([point.seconds for point in curve.points]) for curve in curves]
-    values = [column([value(point) for point in curve.points]) for curve in curves]
+    values = [column([_measures(point).get(title) for point in curve.points]) for curve in curves]
     for index, curve in enumerate(curves):
         options = {"marker": _MARKERS[index % len(_MARKERS)], "color": color_of(index), "label": curve.variant.name}
         draw_points(axes, seconds[index], values[index], markersize=4, linewidth=1, **options)
@@ -383,12 +381,8 @@ class Quality:
 
     def front(self) -> list[VariantResult]:
         """Return the stylized outcomes that no other outcome dominates in style and content, ordered by style."""
-        front: list[VariantResult] = []
         stylized = [outcome for outcome in self.outcomes if outcome.name != UNSTYLIZED]
-        for outcome in sorted(stylized, key=lambda one: (one.judgment.style, one.judgment.content)):
-            if not front or outcome.judgment.content < front[-1].judgment.content:
-                front.append(outcome)
-        return front
+        return undominated(stylized, lambda one: (one.judgment.style, one.judgment.content))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the comparison as JSON-serializable values."""

@@ -1,29 +1,326 @@
 """Plan of a job: what it leaves out or does differently for its scene, with the reason of each choice.
 
-`make_plan` is a pure function of the facts and the settings. Thresholds were measured once; what they rest on stands
-beside them.
+`make_plan` is a pure function of the facts about machine, scene, views and network, and of the settings. No clock is
+read to find the facts. Thresholds were measured once; what they rest on stands beside them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from sgsst_core.budget import memory_for
+from sgsst_core.budget import default_memory_limit, memory_for
 from sgsst_core.errors import SettingsError
-from sgsst_core.loss.terms import MAX_VECTORS, NEAREST_WEIGHTS, has_statistics
-from sgsst_core.planning.facts import Device, Facts, Machine, NetworkPixels
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.partition import computed_twice, scaled_region
+from sgsst_core.features.vgg import (
+    FeatureNetwork,
+    has_bfloat16,
+    has_matrix_units,
+    has_tf32,
+    use_whole_float32,
+)
+from sgsst_core.loss.graphs import can_use_graphs
+from sgsst_core.loss.terms import MAX_VECTORS, NEAREST_WEIGHTS, has_statistics, layers_of
+from sgsst_core.parallel import Collectives, Size, Tiling
 from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import ANOTHER_LOSS, VIEWS, Decision
-from sgsst_core.rasterizer import RASTERIZERS
+from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, drawing_problem, make_rasterizer, rasterizer_for
+from sgsst_core.rasterizer.base import Precision as WeightPrecision
+from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.refine import Refinement
 from sgsst_core.scales import MIN_FALL, ScaleWeights, scale_count, window_length
+from sgsst_core.scene.camera import Camera, spread
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import WHOLE_FLOAT32, CachedWeights, PlannedBackground, PlannedPrecision, Settings
+
+# --- facts ---------------------------------------------------------------------------------------------------------
+
+Device = Literal["cpu", "cuda"]
+
+DTYPES: dict[PlannedPrecision, torch.dtype] = {
+    "float32": torch.float32,
+    "winograd": torch.float32,
+    "tf32": torch.float32,
+    "bfloat16": torch.bfloat16,
+    "float16": torch.float16,
+}
+#: Precisions of cached blend weights, the exact one first, and number of views whose weights are counted.
+_FORMATS: tuple[WeightPrecision, ...] = ("float32", "half")
+_SAMPLED_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Description of the machine and its ranks.
+
+    Attributes:
+        device: Device of the feature network.
+        memory_limit: Memory budget in bytes of all ranks on one machine together, or on one GPU.
+        sharing: Maximum number of ranks that share one machine's memory, or that of a GPU.
+        precisions: Precisions other than float32 that the processors of all ranks compute without emulation.
+        graphs: Whether CUDA graphs can be used: on NVIDIA GPUs, with a PyTorch that survives a failed capture.
+        problems: Reason by name for each GPU rasterizer that does not work; empty on the CPU.
+    """
+
+    device: Device
+    memory_limit: int
+    sharing: int = 1
+    ranks: int = 1
+    precisions: tuple[PlannedPrecision, ...] = ()
+    graphs: bool = False
+    problems: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def memory(self) -> int:
+        """Memory budget of one rank in bytes."""
+        return self.memory_limit // self.sharing
+
+
+@dataclass(frozen=True)
+class Facts:
+    """All facts that a plan follows from, apart from the settings.
+
+    Attributes:
+        gaussians: Number N of Gaussians.
+        sh_degree: SH degree of the scene's file.
+        used_degree: Highest SH degree with a non-zero coefficient after SH attenuation, among the rendered Gaussians.
+        harmonics_energy: See `spherical_harmonics.harmonics_energy`, with the views' blend weights.
+        sizes: (height, width) of each view.
+        rasterizer: Rasterizer that computes blend weights.
+        precision: Precision of the network (`plan.choose_precision`).
+        tiling: Partition of views that the network's activations need.
+        pixel_bytes: Bytes of the network's activations per pixel.
+        weight_bytes: Bytes of the blend weights of all views in float32 and in half precision; None if the rasterizer
+            cannot cache them.
+        intersection_bytes: Bytes of the tile intersections of all views.
+        frozen: [N] bool, frozen Gaussians; None if there are none.
+    """
+
+    gaussians: int
+    sh_degree: int
+    used_degree: int
+    harmonics_energy: float
+    sizes: tuple[Size, ...]
+    survey: Survey
+    machine: Machine
+    rasterizer: str
+    precision: PlannedPrecision
+    tiling: Tiling
+    pixel_bytes: float
+    weight_bytes: tuple[int, int] | None = None
+    intersection_bytes: int = 0
+    frozen: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class NetworkPixels:
+    """Pixels through the network in one iteration on a single rank, mean over views.
+
+    Attributes:
+        all: Pixels through the forward and the backward pass, including halos.
+        sampled: The same with the scales that a mean step of phase 2 evaluates (`Settings.scale_sampling`).
+        coarse: The same with the coarsest scale alone.
+        again: Pixels through a second forward pass, because their activations do not fit in memory.
+        tiles: Maximum number of tiles of a view at one scale.
+        held: Maximum number of pixels in memory at a time, including the temporary memory of a pass in units of pixels.
+    """
+
+    all: float = 0.0
+    sampled: float = 0.0
+    coarse: float = 0.0
+    again: float = 0.0
+    tiles: int = 0
+    held: float = 0.0
+
+    @staticmethod
+    def of(facts: Facts, settings: Settings, *, weighted: bool) -> NetworkPixels:
+        """Count the pixels of the views that see anything."""
+        total, sampled, coarse, again, held, tiles = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+        tiling, views = facts.tiling, facts.survey.covered
+        for index in views:
+            size, passed = facts.sizes[index], list[int]()
+            for scale in reversed(tiling.scales(size)):  # coarsest first
+                own = (size[0] >> scale, size[1] >> scale)
+                region = scaled_region(facts.survey.regions[index], scale, own) if weighted else None
+                areas = [tile.outer.pixels for tile in tiling.tiles(own, region)]
+                flags = tiling.cached(areas)
+                twice, largest = computed_twice(areas, flags), max(areas, default=0)
+                passed.append(sum(areas))
+                again, tiles = again + twice, max(tiles, len(areas))
+                once = max((area for area, flag in zip(areas, flags, strict=True) if not flag), default=0)
+                held = max(held, sum(areas) - twice + tiling.working * largest, (1 + tiling.working) * once)
+            total, coarse = total + sum(passed), coarse + passed[0]
+            sampled += sum(own * float(settings.scale_sampling) ** -place for place, own in enumerate(passed))
+        total, sampled, coarse, again = (each / len(views) for each in (total, sampled, coarse, again))
+        return NetworkPixels(total, sampled, coarse, again, tiles, held)
+
+
+@dataclass(frozen=True)
+class PlanningContext:
+    """Objects that are created for planning, and that the job continues to use.
+
+    Attributes:
+        scene: Whole scene, with the SH attenuation of the settings applied.
+        cameras: Cameras at the size used for stylization.
+        rasterizer: Rasterizer of the whole scene that computes blend weights.
+        networks: Networks created so far, by precision.
+    """
+
+    scene: Scene
+    cameras: tuple[Camera, ...]
+    settings: Settings
+    machine: Machine
+    weights: BackboneWeights
+    rasterizer: Rasterizer
+    networks: dict[PlannedPrecision, FeatureNetwork] = field(default_factory=dict)
+
+    def network(self, precision: PlannedPrecision = "float32") -> FeatureNetwork:
+        """Return the feature network of the job in a precision, created at the first call."""
+        if precision not in self.networks:
+            self.networks[precision] = make_network(self.weights, self.settings, precision, self.machine.device)
+        return self.networks[precision]
+
+
+def equip(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: Settings,
+    weights: BackboneWeights,
+    collectives: Collectives,
+    rasterizer: str | None = None,
+) -> PlanningContext:
+    """Create the planning context. Every rank must call this, and gets the same result up to rounding.
+
+    Args:
+        scene: Scene as it was read.
+        cameras: Cameras at the size used for stylization.
+        rasterizer: Rasterizer that computes blend weights; None to choose one.
+    """
+    scene = scene.attenuated(settings.sh_attenuation)
+    machine = describe_machine(settings, collectives)
+    name = rasterizer or rasterizer_for(machine.device, machine.problems)
+    memory = memory_for("rasterizer", machine.memory)
+    of_scene = make_rasterizer(name, scene, background=settings.background, near=settings.near, memory=memory)
+    return PlanningContext(scene, tuple(cameras), settings, machine, weights, of_scene)
+
+
+def describe_machine(settings: Settings, collectives: Collectives) -> Machine:
+    """Describe what all ranks can use. Every rank must call this, and gets the same result."""
+    device = common_device(collectives)
+    # The partition, and thereby rounding, depends on the limit, so it must be identical on all ranks.
+    limit = settings.memory_limit or default_memory_limit(torch.device(device))
+    has: dict[PlannedPrecision, bool] = {
+        "float16": has_tf32(device),
+        "bfloat16": has_matrix_units() if device == "cpu" else has_bfloat16(device),
+        "tf32": has_tf32(device),
+        "winograd": device == "cpu",
+    }
+    everywhere = collectives.all_gather((limit, has, can_use_graphs(device)))
+    return Machine(
+        device,
+        memory_limit=min(own for own, _, _ in everywhere),
+        sharing=sharing_memory(collectives, device),
+        ranks=collectives.size,
+        precisions=tuple(name for name in has if all(own[name] for _, own, _ in everywhere)),
+        graphs=all(own for _, _, own in everywhere),
+        problems=gpu_problems(collectives) if device == "cuda" else {},
+    )
+
+
+def count_weights(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> tuple[int, int] | None:
+    """Return the bytes of the blend weights of all views in float32 and in half precision, from a few spread views.
+
+    Args:
+        cameras: Cameras of the views that see anything.
+
+    Returns:
+        The bytes; None if the rasterizer cannot cache blend weights.
+    """
+    if not rasterizer.can_cache:
+        return None
+    sample = spread(cameras, _SAMPLED_VIEWS)
+    counted = [rasterizer.count_weights(camera) for camera in sample]
+    whole, half = (sum(each.nbytes(form) for each in counted) * len(cameras) // len(sample) for form in _FORMATS)
+    return whole, half
+
+
+def count_intersections(rasterizer: Rasterizer, views: int) -> int:
+    """Return the bytes of the tile intersections of all views, from those that the survey has computed."""
+    cache = rasterizer.caches.get("intersections")
+    sizes = list(cache.sizes.values()) if cache is not None else []
+    return sum(sizes) * views // max(len(sizes), 1)
+
+
+def common_device(collectives: Collectives) -> Device:
+    """Return the device that is available on all ranks."""
+    return "cuda" if all(collectives.all_gather(torch.cuda.is_available())) else "cpu"
+
+
+def gpu_problems(collectives: Collectives) -> dict[str, str]:
+    """Return the problem of the GPU rasterizer by its name, if it does not work on some rank."""
+    problem = rasterizer_problem(collectives, TritonRasterizer.name)
+    return {} if problem is None else {TritonRasterizer.name: problem}
+
+
+def rasterizer_problem(collectives: Collectives, name: str) -> str | None:
+    """Return the reason why a GPU rasterizer does not work on some rank; None if it works on all."""
+    return next(filter(None, collectives.all_gather(drawing_problem(name))), None)
+
+
+def sharing_memory(collectives: Collectives, device: Device) -> int:
+    """Return the maximum number of ranks that share the memory of a machine, or of a GPU."""
+    return collectives.gpu_sharing if device == "cuda" else max(collectives.all_gather(collectives.local_size))
+
+
+def make_network(
+    weights: BackboneWeights, settings: Settings, precision: PlannedPrecision, device: Device
+) -> FeatureNetwork:
+    """Create the feature network with layers up to the deepest one used."""
+    layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0)
+    use_whole_float32()
+    ways = {"tf32": precision == "tf32", "winograd": precision == "winograd"}
+    return FeatureNetwork(weights, layers, DTYPES[precision], device, **ways)
+
+
+def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: int) -> None:
+    """Check that every scale with a positive weight exists, and that every view has at least one such scale.
+
+    Args:
+        weights: Weights from the finest scale to coarser ones, at least one of them positive; empty for equal weights.
+        coarsest: Maximum shorter side of the coarsest scale in pixels.
+
+    Raises:
+        SettingsError: If a scale with a positive weight exists in no view, or a view has no scale with a positive
+            weight.
+    """
+    requested = ScaleWeights(tuple(weights))
+    if not requested.values:
+        return
+    counts = {camera.name: scale_count(camera.height, camera.width, coarsest) for camera in cameras}
+    most, last = max(counts.values()), max(scale for scale, weight in enumerate(weights) if weight > 0)
+    if last >= most:
+        have = "one scale, 0" if most == 1 else f"{most} scales, 0 to {most - 1}"
+        raise SettingsError(
+            f"--scales gives scale {last} a weight, but the views have {have} (full size): leave it out, or give "
+            "larger views or a smaller --coarsest-side."
+        )
+    for name, count in counts.items():
+        if not requested.chosen(count):
+            raise SettingsError(
+                f"--scales gives no weight to the {count} of {most} scales that view {name!r} has. Give one of them a "
+                "weight, or use views of one size."
+            )
+
+
+# --- the plan ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -132,12 +429,16 @@ _NEEDED: dict[PlannedPrecision, str] = {
     "float16": _GPU,
     "tf32": _GPU,
 }
-#: Error of the pixel gradient in each precision, relative to float32's, at ordinary contrast.
-_ERRORS: dict[PlannedPrecision, str] = {
-    "winograd": "3e-3",
-    "tf32": "1e-2",
-    "float16": "3e-2",
-    "bfloat16": "0.2; up to 0.9 where contrast is low",
+#: Text about each precision, and the error of its pixel gradient relative to float32's, at ordinary contrast.
+_PRECISIONS: dict[PlannedPrecision, tuple[str, str]] = {
+    "float32": ("features in float32", "none"),
+    "winograd": ("convolutions by Winograd's algorithm", "a relative error of the pixel gradient of about 3e-3"),
+    "tf32": ("convolutions in TF32", "a relative error of the pixel gradient of about 1e-2"),
+    "float16": ("features in float16", "a relative error of the pixel gradient of about 3e-2"),
+    "bfloat16": (
+        "features in bfloat16",
+        "a relative error of the pixel gradient of about 0.2; up to 0.9 where contrast is low",
+    ),
 }
 #: Minimum visits of each view size for which CUDA graphs of the loss pay off, and maximum pixels of a view: a step of
 #: 980x545 takes 19 ms without and 8 ms with a graph, because the GPU waits for 15 ms of launches, which larger views
@@ -217,8 +518,7 @@ def make_plan(
     cached, about_weights = _blend_weights(plan, facts, settings)
     if cached != "none":
         plan = replace(plan, rasterizer="cached", cached_weights=cached)
-    graphs, novel = _why_no_graphs(plan, facts, settings) is None, _novel_views(plan, settings)
-    plan = replace(plan, graphs=graphs, novel_views=novel)
+    plan = replace(plan, graphs=_has_graphs(plan, facts, settings), novel_views=_novel_views(plan, settings))
     plan = _with_memory(plan, facts, pixels)
     per_rank = settings.views_per_step / plan.ranks
     passes = (plan.loss_views + _NOVEL_PASSES * plan.novel_views) / 3 if measured else 0.0
@@ -226,9 +526,9 @@ def make_plan(
     lines = (
         *about,
         *_about_gaussians(plan, facts, settings),
-        *_about_coverage(plan, facts, settings, pixels),
+        *_about_coverage(plan, facts, settings),
         *_about_network(facts, settings, pixels),
-        *_about_rasterizer(plan, facts, settings),
+        *_about_rasterizer(plan, facts),
         about_weights,
         *_about_schedule(plan, facts, settings),
         *_about_ranks(plan, facts, settings),
@@ -307,15 +607,6 @@ def _visits(plan: Plan, settings: Settings) -> int:
     return (plan.steps_coarse + settings.steps_sos) * settings.views_per_step
 
 
-def _visits_of_a_size(plan: Plan, facts: Facts, settings: Settings) -> int:
-    """Return the passes of images of one size through the network in the whole schedule.
-
-    With weighted statistics, every view has its own size, because it is cropped to its covered pixels.
-    """
-    different = len(plan.covered) if plan.weighted else len({facts.sizes[index] for index in plan.covered})
-    return _visits(plan, settings) // different
-
-
 def _blend_weights(plan: Plan, facts: Facts, settings: Settings) -> tuple[CachedWeights, Decision]:
     """Choose the format of cached blend weights: float32 or half precision, as fits; none if it saves no time."""
     item, why_not = "blend weights", _why_not_cached(plan, facts, settings)
@@ -325,10 +616,8 @@ def _blend_weights(plan: Plan, facts: Facts, settings: Settings) -> tuple[Cached
     budget, cached = memory_for("rasterizer", facts.machine.memory), settings.cached_weights
     if cached == "auto":
         cached = "float32" if whole <= budget or settings.preset == "paper" else "half"
-    name, size, error = "float32", whole, "none"
-    if cached == "half":
-        name, size = "half precision", halved
-        error = "each weight is off by at most 1/2048 of its value: 0.12 of 255 levels per pixel"
+    half = "half precision", halved, "each weight is off by at most 1/2048 of its value: 0.12 of 255 levels per pixel"
+    name, size, error = half if cached == "half" else ("float32", whole, "none")
     of_a_view = size / len(plan.covered)
     portion = "all" if size <= budget else f"{budget // of_a_view * of_a_view / size:.0%} of the views'"
     reason = f"they take {size / 1e9:.2f} GB for all views; {budget / 1e9:.1f} GB are available for blend weights"
@@ -349,18 +638,13 @@ def _why_not_cached(plan: Plan, facts: Facts, settings: Settings) -> str | None:
     return f"a view is visited only {visits:.1f} times" if visits < _CACHED_VISITS else None
 
 
-def _why_no_graphs(plan: Plan, facts: Facts, settings: Settings) -> str | None:
-    """Return the reason why the loss of a view is not captured as a CUDA graph; None if it is."""
-    visits = _visits_of_a_size(plan, facts, settings)
-    if not facts.machine.graphs:
-        return "CUDA graphs need an NVIDIA GPU and PyTorch 2.13 or later"
-    if plan.ranks > math.gcd(settings.views_per_step, plan.ranks):  # several ranks work on the same view
-        return "a graph cannot contain communication between workers"
-    if visits < _GRAPH_VISITS:
-        return f"views of one size are visited only {visits:,} times"
-    if max(height * width for height, width in facts.sizes) > _GRAPH_PIXELS:
-        return "views are so large that the GPU does not wait for launches"
-    return None
+def _has_graphs(plan: Plan, facts: Facts, settings: Settings) -> bool:
+    """Return whether the loss of a view is captured as a CUDA graph. A graph cannot contain communication."""
+    alone = plan.ranks == math.gcd(settings.views_per_step, plan.ranks)  # no two ranks work on the same view
+    small = max(height * width for height, width in facts.sizes) <= _GRAPH_PIXELS
+    # With weighted statistics, every view has its own size, because it is cropped to its covered pixels.
+    sizes = len(plan.covered) if plan.weighted else len({facts.sizes[index] for index in plan.covered})
+    return facts.machine.graphs and alone and small and _visits(plan, settings) // sizes >= _GRAPH_VISITS
 
 
 def _novel_views(plan: Plan, settings: Settings) -> int:
@@ -382,13 +666,16 @@ def _with_memory(plan: Plan, facts: Facts, pixels: NetworkPixels) -> Plan:
     areas = sum(facts.sizes[index][0] * facts.sizes[index][1] for index in plan.covered)
     of_views = int(4 / 3 * _TARGET_BYTES * areas) + 12 * facts.gaussians * len(plan.covered) * bool(facts.used_degree)
     cached = 0 if plan.cached_weights == "none" else (facts.weight_bytes or (0, 0))[plan.cached_weights == "half"]
-    used = needed + min(of_views, memory_for("views", memory) + spare // 2)
-    used += min(facts.intersection_bytes + cached, memory_for("rasterizer", memory) + spare // 2)
-    used += min(memory_for("measuring", memory), 4 * plan.novel_views * _TARGET_BYTES * areas // len(plan.covered))
+    of_novel_views = 4 * plan.novel_views * _TARGET_BYTES * areas // len(plan.covered)
+    used = (
+        needed
+        + min(of_views, memory_for("views", memory) + spare // 2)
+        + min(facts.intersection_bytes + cached, memory_for("rasterizer", memory) + spare // 2)
+        + min(of_novel_views, memory_for("measuring", memory))
+    )
     of_scene = facts.gaussians * (_GAUSSIAN_BYTES + 24 * (facts.sh_degree + 1) ** 2)
-    process, device = _PROCESS_BYTES + of_scene + (used if plan.device == "cpu" else 0), None
-    if plan.device == "cuda":
-        device = used + of_scene
+    process = _PROCESS_BYTES + of_scene + (used if plan.device == "cpu" else 0)
+    device = used + of_scene if plan.device == "cuda" else None
     return replace(plan, spare=spare, peak_bytes=process, device_bytes=device)
 
 
@@ -402,65 +689,43 @@ def _about_gaussians(plan: Plan, facts: Facts, settings: Settings) -> Iterator[D
         frozen = settings.unseen == "freeze"
         change = "keep their colors" if frozen else "follow their neighbors' color change at the end"
         unused = f"{unseen:,} of {count:,} are neither rendered nor optimized; they {change}"
-        reason = "no pixel of any view shows them"
-        yield Decision("unseen Gaussians", unused, reason, bytes=unseen * OPTIMIZER_BYTES)
-    item, attenuation = "spherical harmonics", settings.sh_attenuation
-    degree, used = facts.sh_degree, facts.used_degree
-    saved = count * 3 * ((degree + 1) ** 2 - (used + 1) ** 2) * 4
-    if not degree:
-        nothing = ": there is nothing to attenuate" if attenuation else ""
-        yield Decision(item, "no view directions are computed", f"the scene has degree 0{nothing}")
-    elif attenuation == 1:
-        without = f"degrees 1 to {degree} are attenuated to 0, in the result too; no view directions are computed"
-        error = "colors no longer depend on the view direction"
-        yield Decision(item, without, "requested", bytes=saved, error=error)
-    elif attenuation:
-        less = (
-            f"coefficients of degrees 1 to {degree} are multiplied by {1 - attenuation:.3g}, in the result too; "
-            f"evaluated up to degree {used}"
-        )
-        yield Decision(item, less, "requested", error="colors depend less on the view direction")
-    else:
-        if facts.harmonics_energy >= _VIEW_DEPENDENT:
-            advice = "unchanged, so highlights keep their tint; --sh-attenuation 1 removes it"
-            reason = f"{facts.harmonics_energy:.0%} of the color variance depends on the view direction"
-            yield Decision("view-dependent color", advice, reason)
-        if used < degree:
-            zeros = f"all coefficients of degrees {used + 1} to {degree} are 0"
-            yield Decision(item, f"evaluated up to degree {used}", zeros, bytes=saved)
+        yield Decision("unseen Gaussians", unused, "no pixel of any view shows them", bytes=unseen * OPTIMIZER_BYTES)
+    degree, used, attenuation = facts.sh_degree, facts.used_degree, settings.sh_attenuation
+    saved = count * 3 * ((degree + 1) ** 2 - (used + 1) ** 2) * 4 or None
+    if attenuation and degree:
+        less = f"coefficients of degrees 1 to {degree} are multiplied by {1 - attenuation:.3g}, in the result too"
+        error = "colors depend less on the view direction"
+        yield Decision("spherical harmonics", less, "requested", bytes=saved, error=error)
+    elif used < degree:
+        zeros = f"all coefficients of degrees {used + 1} to {degree} are 0"
+        yield Decision("spherical harmonics", f"evaluated up to degree {used}", zeros, bytes=saved)
+    if not attenuation and facts.harmonics_energy >= _VIEW_DEPENDENT:
+        advice = "unchanged, so highlights keep their tint; --sh-attenuation 1 removes it"
+        reason = f"{facts.harmonics_energy:.0%} of the color variance depends on the view direction"
+        yield Decision("view-dependent color", advice, reason)
 
 
-def _about_coverage(plan: Plan, facts: Facts, settings: Settings, pixels: NetworkPixels) -> Iterator[Decision]:
+def _about_coverage(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
     """Yield the decisions about empty views, uncovered pixels, backgrounds, and the colors at the start."""
     uncovered = f"{plan.survey.uncovered_fraction:.1%} of the views' pixels are uncovered"
     total, blind = len(facts.sizes), len(facts.sizes) - len(plan.covered)
     if blind:
         yield Decision(VIEWS, f"{blind} of {total} are skipped", "they see no Gaussian")
-    if pixels.all < pixels.without_region:
-        skipped = f"{1 - pixels.all / pixels.without_region:.0%} of the pixels skip the network"
-        yield Decision("uncovered pixels", skipped, uncovered)
     if plan.weighted:
+        yield Decision("uncovered pixels", "tiles and borders without covered pixels skip the network", uncovered)
         yield Decision("position weights", "statistics are weighted by coverage", uncovered, error=ANOTHER_LOSS)
     if plan.training_background != "background":
-        random = plan.training_background == "random"
-        color = "a random color" if random else "the color of a random pixel of the style"
-        requested = settings.training_background != "auto"
+        random, requested = plan.training_background == "random", settings.training_background != "auto"
+        color = "a random color each time" if random else "the color of a random pixel of the style each time"
         reason = "requested" if requested else f"{uncovered}: colors would be fitted to a fixed background"
-        if settings.content_weight:
-            reason += "; content features are recomputed with it in every step"
-        yield Decision("training background", f"{color} each time", reason, error=ANOTHER_LOSS)
+        yield Decision("training background", color, reason, error=ANOTHER_LOSS)
     by_luminance = settings.preserve_colors == "luminance"
     if plan.warm_start:
-        start = "colors start with the style's distribution"
-        if by_luminance:
-            start = "luminance starts with the style's mean and standard deviation"
+        luminance = "luminance starts with the style's mean and standard deviation"
+        start = luminance if by_luminance else "colors start with the style's distribution"
         if ends_with_transfer(settings, warm=True):
             start += f"; they are reset to it after the last step, because {settings.style_loss} lets them drift"
-        reason = "steps change the overall color only slowly"
-        if settings.warm_start is not None:
-            reason = "requested"
-        elif plan.weighted and plan.survey.uncovered_fraction > _SCAN:
-            reason = f"{uncovered}: nothing around the object determines how bright it should be"
+        reason = "steps change the overall color only slowly" if settings.warm_start is None else "requested"
         yield Decision("start", start, reason, error="differs from the paper's start")
     if by_luminance:
         line = "only luminance is compared and optimized; each Gaussian keeps its chroma"
@@ -468,82 +733,61 @@ def _about_coverage(plan: Plan, facts: Facts, settings: Settings, pixels: Networ
 
 
 def _about_network(facts: Facts, settings: Settings, pixels: NetworkPixels) -> Iterator[Decision]:
-    """Yield the decisions about layers, style loss, content, partition and forward passes."""
-    layers = f"up to {facts.deepest}, the deepest one used"
-    yield Decision("network layers", layers, "the loss reads no deeper layer")
+    """Yield the decisions about style loss, partition and forward passes."""
     if settings.style_loss != "sos":
-        weight = NEAREST_WEIGHTS[settings.style_loss]
         what = "replaces the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
         distance = (
             f"the distance of relu3 features to the nearest of at most {MAX_VECTORS:,} style features {what}, with "
-            f"weight {weight:.3g}"
+            f"weight {NEAREST_WEIGHTS[settings.style_loss]:.3g}"
         )
         yield Decision("style loss", distance, f"{settings.style_loss} was requested", error=ANOTHER_LOSS)
-    if not settings.content_weight:
-        yield Decision("content", "no content features are computed or cached", "its weight is 0")
     memory = f"the {memory_for('activations', facts.machine.memory) / 1e9:.1f} GB for activations"
-    if pixels.tiles <= 1:
-        yield Decision("partition", "none: the network takes each view as a whole", f"it fits in {memory}")
-    else:
-        tiles = f"up to {pixels.tiles} tiles per view"
-        yield Decision("partition", tiles, f"larger tiles would not fit in {memory}")
-    if pixels.again:
-        again = pixels.again / pixels.all
-        reason = f"activations of {1 - again:.0%} of the pixels fit in {memory}"
-        yield Decision("second forward", f"for {again:.0%} of the pixels", reason)
-    else:
-        none = "none: activations are cached between statistics and gradient"
-        yield Decision("second forward", none, f"they fit in {memory}")
+    whole = "none: the network takes each view as a whole"
+    tiles = whole if pixels.tiles <= 1 else f"up to {pixels.tiles} tiles per view"
+    yield Decision("partition", tiles, f"tiles are as large as fit in {memory}")
+    again = pixels.again / pixels.all
+    reason = f"activations of {1 - again:.0%} of the pixels fit in {memory}"
+    yield Decision("second forward", f"for {again:.0%} of the pixels", reason)
 
 
-def _about_rasterizer(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
+def _about_rasterizer(plan: Plan, facts: Facts) -> Iterator[Decision]:
     """Yield the decisions about the rasterizer and kernel launches on a GPU; on the CPU there is no choice."""
     if plan.device != "cuda":
         return
-    used = RASTERIZERS[facts.rasterizer]
-    how = f"{used.title} on the GPU" if used.on_gpu else "on the CPU"
-    if plan.cached_weights != "none":
-        how += ", with cached blend weights"
-    problems = facts.machine.problems.items()
+    problems, used = facts.machine.problems.items(), RASTERIZERS[facts.rasterizer]
     reasons = [f"{RASTERIZERS[name].title} cannot be used: {problem}" for name, problem in problems]
-    if used.on_gpu:
-        reasons.append(f"{used.title} works here")
-    yield Decision("rasterizer", how, "; ".join(reasons) or "requested")
-    if reason := _why_no_graphs(plan, facts, settings):
-        yield Decision("launches", "kernel by kernel", reason)
-    else:
-        visited = f"views of one size are visited {_visits_of_a_size(plan, facts, settings):,} times"
-        yield Decision("launches", "the loss of a view is captured as a CUDA graph", visited)
+    device = "GPU" if used.on_gpu else "CPU"
+    yield Decision("rasterizer", f"{used.title} on the {device}", "; ".join(reasons) or "it works here")
+    launches = "the loss of a view is captured as a CUDA graph" if plan.graphs else "kernel by kernel"
+    reason = (
+        f"graphs, with NVIDIA GPUs and PyTorch 2.13, are for views of at most {_GRAPH_PIXELS / 1e6:.1f} megapixels, "
+        f"visited at least {_GRAPH_VISITS} times, and not divided among workers"
+    )
+    yield Decision("launches", launches, reason)
 
 
 def _about_schedule(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
     """Yield the decisions about scales and their weights, phases, and stopping early."""
     counts = [scale_count(*facts.sizes[index], settings.coarsest_side) for index in plan.covered]
     scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
-    reason = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
-    yield Decision("scales", scales, reason)
+    halved = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
+    yield Decision("scales", scales, halved)
     if settings.scales:
-        weights, most = ScaleWeights(settings.scales), max(counts)
-        chosen = weights.chosen(most)
-        text = ", ".join(f"scale {scale} {weights.of(scale):g}" for scale in chosen)
-        if len(chosen) < most:
-            text += f"; {most - len(chosen)} of {most} scales are not computed"
-        yield Decision("weights of scales", text, "requested", error=ANOTHER_LOSS)
+        weights = ScaleWeights(settings.scales)
+        text = ", ".join(f"scale {scale} {weights.of(scale):g}" for scale in weights.chosen(max(counts)))
+        yield Decision("weights of scales", f"{text}; others are not computed", "requested", error=ANOTHER_LOSS)
     if settings.scale_sampling > 1 and not _has_one_phase(facts, settings):
         text = f"of {settings.scale_sampling} visits of a view, drawn at random, one evaluates the next finer scale too"
         reason = "gradients are the same on average, and finer scales cost most"
         yield Decision("scale sampling", text, reason, error="more noise in single gradients")
     if plan.steps_coarse < settings.steps_coarse:
-        reason = f"{'only one scale has a weight' if settings.scales else 'there is only one scale'}, so it would be "
-        skipped, error = (
-            f"its {settings.steps_coarse} steps are skipped",
+        skipped = f"its {settings.steps_coarse} steps are skipped"
+        reason, error = (
+            "with one scale, it would be the same as phase 2",
             "these steps, which would reduce the same loss",
         )
-        yield Decision("phase 1", skipped, f"{reason}the same as phase 2", error=error)
-    if settings.early_stop and plan.training_background != "background":
-        reason = "losses on different backgrounds cannot be compared"
-        yield Decision("early stop", "none: all steps are run", reason)
-    elif settings.early_stop:
+        yield Decision("phase 1", skipped, reason, error=error)
+    if settings.early_stop and plan.training_background == "background":
         when = (
             f"when the mean loss of {window_length(len(plan.covered))} steps is less than {MIN_FALL:.1%} below that of "
             "the same number of steps before"
@@ -556,43 +800,31 @@ def _about_ranks(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decis
     if plan.device != "cpu" and facts.machine.sharing > 1:
         reason = f"{facts.machine.sharing} of them share a GPU, which NCCL does not support; give each a GPU of its own"
         yield Decision("communication", "ranks exchange data over the CPU (gloo)", reason)
-    if plan.ranks == 1:
-        return
     if plan.groups > 1:
         each = f"all {plan.ranks} take part, each with a view of its own in fewer steps"
         error = "steps average the gradients of several views"
         yield Decision("ranks", each, "views are too small to divide among so many", error=error)
-        return
-    groups = math.gcd(settings.views_per_step, plan.ranks)
-    how = f"{plan.ranks // groups} divide each view" if groups < plan.ranks else "each has a view of its own"
-    yield Decision("ranks", f"all {plan.ranks} take part", how)
+    elif plan.ranks > 1:
+        groups = math.gcd(settings.views_per_step, plan.ranks)
+        how = f"{plan.ranks // groups} divide each view" if groups < plan.ranks else "each has a view of its own"
+        yield Decision("ranks", f"all {plan.ranks} take part", how)
 
 
 def _about_precision(plan: Plan, settings: Settings) -> Iterator[Decision]:
     """Yield the decision about the network's precision; none if float32 was requested."""
-    name, requested = plan.precision, settings.precision
-    if requested == "float32":
-        return
-    if name == "float32":
-        yield Decision("precision", "features in float32", "exact; this device has no faster precision")
-        return
-    how = {"winograd": "by Winograd's algorithm", "tf32": "in TF32"}.get(name, f"in {name}")
-    what = f"{'convolutions' if name in ('tf32', 'winograd') else 'features'} {how}"
-    reason = "requested" if requested != "auto" else "the fastest that the processor computes"
-    yield Decision("precision", what, reason, error=f"a relative error of the pixel gradient of about {_ERRORS[name]}")
+    if settings.precision != "float32":
+        what, error = _PRECISIONS[plan.precision]
+        reason = "requested" if settings.precision != "auto" else "the fastest that the processor computes"
+        yield Decision("precision", what, reason, error=error)
 
 
 def _about_measuring(plan: Plan, settings: Settings) -> Iterator[Decision]:
     """Yield the decision about measurements outside of the steps."""
-    if not plan.measured:
-        return
-    what = f"the loss before the steps on {_count(plan.loss_views, 'view')}"
-    if plan.novel_views:
-        what += f", and {_count(plan.novel_views, 'novel view')} before and after"
-    visits = _visits(plan, settings)
-    reason = f"at most {settings.measure:.0%} of the {visits:,} passes in the steps"
-    reason += "" if plan.novel_views else ", too few for novel views"
-    yield Decision("measuring", what, reason)
+    if plan.measured:
+        loss = f"the loss before the steps on {_count(plan.loss_views, 'view')}"
+        what = f"{loss}, and {_count(plan.novel_views, 'novel view')} before and after"
+        reason = f"at most {settings.measure:.0%} of the {_visits(plan, settings):,} passes in the steps"
+        yield Decision("measuring", what, reason)
 
 
 def _count(number: int, what: str) -> str:

@@ -7,8 +7,9 @@ are distributed among ranks. The thresholds of the checks separate real captures
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import mean, median
 
@@ -23,7 +24,7 @@ from sgsst_core.progress import Decision, Progress
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 
 #: Below this coverage, the color of a pixel is invisible in 8 bits.
 SEEN_COVERAGE = 1 / 255
@@ -71,11 +72,13 @@ def survey_views(
     rasterizer: Rasterizer,
     collectives: Collectives = ALONE,
     show: ShowPlanning | None = None,
+    visit: Callable[[Camera, Tensor], None] | None = None,
 ) -> Survey:
     """Survey every view once; all ranks get the same result.
 
     Args:
         show: Callback, called before the first view of this rank and after each view.
+        visit: Callback for the camera of each view of this rank that sees anything, and its blend weights [N].
 
     Raises:
         CameraError: If no camera sees a Gaussian.
@@ -92,6 +95,8 @@ def survey_views(
             views[index] = covered_region(coverage), uncovered, seen
             if seen:
                 weights += summed.double()
+                if visit:
+                    visit(cameras[index], summed)
     for others in collectives.all_gather(views):
         views |= others
     pixels = [camera.width * camera.height for camera in cameras]
@@ -111,8 +116,8 @@ _GAUSSIANS, _CAMERAS = 20_000, 200
 #: Least fraction of the Gaussians in a frame, and of all, that the near plane hides if it is reported. Captures in
 #: meters have nearly none.
 _MUCH_OF_FRAMES, _MUCH_OF_SCENE = 0.1, 0.01
-#: Fraction of the Gaussians in the frames that may lie nearer than a suggested near plane, and its margin.
-_NEAREST, _MARGIN = 0.01, 0.5
+#: Fraction of the Gaussians in the frames that a suggested near plane may hide.
+_NEAREST = 0.01
 
 
 @dataclass(frozen=True)
@@ -122,14 +127,10 @@ class Shown:
     Attributes:
         typical: Fraction in one frame, median over the cameras.
         together: Fraction in at least one frame.
-        nearer: Fraction in at least one frame, but nearer than the near plane in all of these.
-        near: Distance of a near plane that hides nearly none of them; None if `nearer` is not remarkable.
     """
 
     typical: float
     together: float
-    nearer: float = 0.0
-    near: float | None = None
 
 
 def shown_by(means: Tensor, cameras: Sequence[Camera], near: float) -> Shown:
@@ -141,35 +142,29 @@ def shown_by(means: Tensor, cameras: Sequence[Camera], near: float) -> Shown:
         near: Distance of the near plane in world units.
     """
     points = means[:: max(1, len(means) // _GAUSSIANS)].double()
-    together, nearer = torch.zeros(2, len(points), dtype=torch.bool)
-    fractions, depths = [], []
+    together, fractions = torch.zeros(len(points), dtype=torch.bool), []
     for camera in spread(cameras, _CAMERAS):
         x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
         across, down = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (z > 0) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
-        depths.append(z[inside])
-        nearer |= inside & (z <= near)
-        inside &= z > near
+        inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
         together |= inside
         fractions.append(float(inside.double().mean()))
-    nearer &= ~together
-    hidden, in_frames = float(nearer.double().mean()), float((nearer | together).double().mean())
-    remarkable = hidden >= max(_MUCH_OF_SCENE, _MUCH_OF_FRAMES * in_frames)
-    suggested = _suggested(torch.cat(depths)) if remarkable else None
-    return Shown(median(fractions), float(together.double().mean()), hidden, suggested)
+    return Shown(median(fractions), float(together.double().mean()))
 
 
-def _suggested(depths: Tensor) -> float:
-    """Return a near plane with one digit, given the depths of Gaussians in frames."""
-    near = _MARGIN * float(depths.sort().values[int(_NEAREST * len(depths))])
-    digit = 10.0 ** math.floor(math.log10(max(near, 1e-30)))
-    return float(f"{math.floor(near / digit) * digit:.0e}") or near
+def near_plane(means: Tensor, cameras: Sequence[Camera], near: float) -> tuple[str, float] | None:
+    """Return how many Gaussians the near plane hides in the frames of cameras, and one that hides nearly none.
 
-
-def hidden_text(shown: Shown, gaussians: int, near: float) -> str:
-    """Return how many of a scene's Gaussians the near plane hides."""
-    count = round(shown.nearer * gaussians)
-    return f"{count:,} of {gaussians:,} Gaussians are in their frames, but nearer than the near plane at {near:g}"
+    The arguments are those of `shown_by`. The result is None if the near plane hides few.
+    """
+    drawn, in_frames = (shown_by(means, cameras, each).together for each in (near, 0.0))
+    if in_frames - drawn < max(_MUCH_OF_SCENE, _MUCH_OF_FRAMES * in_frames):
+        return None
+    nearer = (near / 10.0**power for power in range(1, 30))
+    enough = (each for each in nearer if shown_by(means, cameras, each).together >= (1 - _NEAREST) * in_frames)
+    count = round((in_frames - drawn) * len(means))
+    text = f"{count:,} of {len(means):,} Gaussians are in their frames, but nearer than the near plane at {near:g}"
+    return text, next(enough, near / 1e30)
 
 
 def nothing_seen(means: Tensor, cameras: Sequence[Camera], near: float) -> CameraError:
@@ -177,12 +172,9 @@ def nothing_seen(means: Tensor, cameras: Sequence[Camera], near: float) -> Camer
 
     The arguments are those of `shown_by`.
     """
-    shown = shown_by(means, cameras, near)
     none = f"None of the {len(cameras)} cameras sees a Gaussian"
-    if shown.near is not None:
-        return CameraError(
-            f"{none}: {hidden_text(shown, len(means), near)}. Add --near {shown.near:g}, which suits the scene's units."
-        )
+    if hidden := near_plane(means, cameras, near):
+        return CameraError(f"{none}: {hidden[0]}. Add --near {hidden[1]:g}, which suits the scene's units.")
     return CameraError(
         f"{none}. Check that cameras and scene belong together (same training run, same world), or let an orbit make "
         "the cameras."
@@ -235,10 +227,10 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
     """
     single = [camera for camera in cameras if camera.panorama is None]
     shown = shown_by(scene.means, single or cameras, near)
-    hidden = []
-    if shown.near is not None:
-        warning = f"warning: {hidden_text(shown, len(scene), near)}"
-        hidden = [Decision("cameras", warning, f"they are not drawn; add --near {shown.near:g} to draw them")]
+    hidden = [
+        Decision("cameras", f"warning: {text}", f"they are not drawn; add --near {closer:g} to draw them")
+        for text, closer in filter(None, [near_plane(scene.means, single or cameras, near)])
+    ]
     if not single or shown.typical >= _LITTLE_SHOWN or (hidden and shown.together):
         return hidden
     rasterizer = make_rasterizer("cpu", scene, near=near)
@@ -264,8 +256,8 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
     return [Decision("cameras", f"{OTHER_FRAME}: {text}", advice)]
 
 
-def implausible(means: Tensor, cameras: Sequence[Camera]) -> list[Decision]:
-    """Return warnings about values of cameras that no real capture has.
+def implausible(means: Tensor, cameras: Sequence[Camera]) -> Iterator[Decision]:
+    """Yield warnings about values of cameras that no real capture has.
 
     Args:
         means: Positions of the scene, [N, 3].
@@ -273,17 +265,13 @@ def implausible(means: Tensor, cameras: Sequence[Camera]) -> list[Decision]:
     points = means[:: max(1, len(means) // _SAMPLE)].double()
     center = points.median(dim=0).values
     extent = max(float((points - center).norm(dim=1).quantile(_WITHIN)), _TINY)
-    lines = []
     for text, value_of, low, high in _BOUNDS:
         values = [(value_of(camera, center, extent), camera.name) for camera in cameras]
         wrong = [(value, name) for value, name in values if not low <= value <= high]
         if wrong:
             warning = f"warning: {len(wrong)} of {len(cameras)} have {text} that no real capture has"
             reason = f"{wrong[0][1]} has {wrong[0][0]:.3g}; expected {low:g} to {high:g}. Export the cameras again"
-            lines.append(
-                Decision("cameras", warning, f"{reason}, with the sizes of their images and the scene's units")
-            )
-    return lines
+            yield Decision("cameras", warning, f"{reason}, with the sizes of their images and the scene's units")
 
 
 def compare_photos(
@@ -297,13 +285,13 @@ def compare_photos(
     Raises:
         ImageError: If a photo cannot be read.
     """
-    likeness = _Likeness(scene, near)
+    likeness = functools.partial(_likeness, scene, make_rasterizer("cpu", scene, near=near))
     photos, decisions = list(photos), []
     doubtful = [index for index, photo in enumerate(photos) if photo.ambiguous]
     if doubtful:
         some = spread(doubtful, _VIEWS)
-        stored = mean(likeness.psnr(photos[index], cameras[index]) or 0.0 for index in some)
-        oriented = mean(likeness.psnr(replace(photos[index], oriented=True), cameras[index]) or 0.0 for index in some)
+        stored = mean(likeness(photos[index], cameras[index]) or 0.0 for index in some)
+        oriented = mean(likeness(replace(photos[index], oriented=True), cameras[index]) or 0.0 for index in some)
         if oriented > stored:
             photos = [replace(photo, oriented=True) if photo.ambiguous else photo for photo in photos]
         used = f"the EXIF orientation of {len(doubtful)} photos is {'applied' if oriented > stored else 'ignored'}"
@@ -312,7 +300,7 @@ def compare_photos(
         )
         decisions.append(Decision("photos", used, reason))
     pairs = spread(list(zip(photos, cameras, strict=True)), _VIEWS)
-    values = [likeness.psnr(photo, camera) for photo, camera in pairs]
+    values = [likeness(photo, camera) for photo, camera in pairs]
     psnr = median([value for value in values if value is not None] or [math.inf])
     if psnr < _UNLIKE_PSNR:
         decisions.append(
@@ -327,26 +315,14 @@ def compare_photos(
     return photos, decisions
 
 
-class _Likeness:
-    """Comparison of photos with small renders of a scene."""
-
-    def __init__(self, scene: Scene, near: float) -> None:
-        self._scene, self._rasterizer = scene, make_rasterizer("cpu", scene, near=near)
-        self._renders: dict[bytes, tuple[Tensor, Tensor]] = {}
-
-    def psnr(self, photo: Photo, camera: Camera) -> float | None:
-        """Return the PSNR in dB of a photo against its view's render; None if the scene covers too little of it."""
-        view = resized(camera, min(camera.side, _SIDE))
-        key = view.world_to_camera.numpy().tobytes()  # names may repeat
-        if key not in self._renders:
-            colors = view_colors(self._scene.sh_dc, rest_colors(self._scene.sh_rest, self._scene.means, view))
-            coverage = self._rasterizer.coverage(view)[..., None]
-            self._renders[key] = _averaged(self._rasterizer.render(colors, view)), _averaged(coverage)[..., 0]
-        render, coverage = self._renders[key]
-        compared = coverage > _COVERED
-        if float(compared.double().mean()) < _LEAST_COMPARED:
-            return None
-        return fitted_psnr(_averaged(load_photo(photo, view)), render, compared)
+def _likeness(scene: Scene, rasterizer: Rasterizer, photo: Photo, camera: Camera) -> float | None:
+    """Return the PSNR in dB of a photo against its view's render; None if the scene covers too little of it."""
+    view = resized(camera, min(camera.side, _SIDE))
+    compared = _averaged(rasterizer.coverage(view)[..., None])[..., 0] > _COVERED
+    if float(compared.double().mean()) < _LEAST_COMPARED:
+        return None
+    render = _averaged(rasterizer.render(scene_colors(scene, view), view))
+    return fitted_psnr(_averaged(load_photo(photo, view)), render, compared)
 
 
 def _averaged(image: Tensor) -> Tensor:

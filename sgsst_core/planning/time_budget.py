@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from sgsst_core.planning.facts import evaluated_pixels
 from sgsst_core.progress import Decision, duration
+from sgsst_core.scales import ScaleWeights, scale_count
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.settings import Settings
 
@@ -213,3 +213,14 @@ def _steps(settings: Settings, fraction: float) -> tuple[int, int]:
         for name, asked in (("steps_coarse", settings.steps_coarse), ("steps_sos", settings.steps_sos))
     )
     return coarse, max(sos, int(not coarse and bool(settings.steps_sos)))
+
+
+def evaluated_pixels(cameras: Sequence[Camera], settings: Settings) -> tuple[float, int]:
+    """Return the pixels of a view that a mean step of phase 2 evaluates on all its scales, and the most scales."""
+    pixels, most = 0.0, 1
+    for camera in cameras:
+        scales = scale_count(camera.height, camera.width, settings.coarsest_side)
+        evaluated = ScaleWeights(settings.scales).evaluated(scales, settings.scale_sampling)
+        pixels += camera.width * camera.height * evaluated
+        most = max(most, scales)
+    return pixels / len(cameras), most

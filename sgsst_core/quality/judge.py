@@ -38,7 +38,7 @@ from sgsst_core.scene.colors import luminance, resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Moments, Style, color_moments, square_root, style_moments
-from sgsst_core.stylizing.job import JobStyles
+from sgsst_core.stylizing.styles import JobStyles
 
 #: Maximum longer side of judged views in pixels. The limit keeps results at different resolutions comparable, and
 #: bounds the cost of large views.

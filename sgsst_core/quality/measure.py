@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -32,8 +31,7 @@ from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import WHOLE_FLOAT32, StyleLossName
-from sgsst_core.stylizing.steps import Evaluation, ShowViews, evaluate, show_nothing
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Evaluation, ShowViews, Stylizer, evaluate, show_nothing
 from sgsst_core.stylizing.views import Views, ViewTargets
 
 
@@ -60,7 +58,7 @@ class Measurements:
         stylizer = self._stylizer
         if not self.approximated:
             return stylizer.start(self._show)
-        with stylizer.measuring():
+        with stylizer.timed("measuring"):
             return self.exact.evaluate(stylizer.job.evaluation_views, stylizer.job.scene.sh_dc, self._show)
 
     def at_the_end(self) -> None:
@@ -68,7 +66,7 @@ class Measurements:
         stylizer, most = self._stylizer, self._stylizer.job.plan.novel_views
         if not most:
             return
-        with stylizer.measuring():
+        with stylizer.timed("measuring"):
             novel_views = make_novel_views(stylizer, lpips=load_lpips_or_none(stylizer.job.network.device), most=most)
             moments, errors = [], []
             for start in (True, False):
@@ -252,8 +250,7 @@ class Float32Reference:
             index, phase = stylizer.history[-1].view, stylizer.phase
         scales = phase.scales(stylizer.job.scales(index))
         colors = stylizer.job.scene.sh_dc if start else stylizer.stylized()
-        with stylizer.with_colors(colors) if start or stylizer.job.transfers_last else nullcontext():
-            approximate, seconds = stylizer.gradient(index, scales)
+        approximate, seconds = stylizer.gradient(index, scales, colors[self.seen])
         exact, seconds_exact = self.gradient(index, colors, scales)
         difference = Difference.of(approximate, exact[self.seen])
         step, view = 0 if start else stylizer.step, stylizer.job.views.cameras[index].name

@@ -30,7 +30,7 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions import RegionMaps
 from sgsst_core.scene.camera import Camera, between, moved, nearest_walk, similarly_rotated, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.stylizing.steps import ShowViews, show_nothing
+from sgsst_core.stylizing.stylizer import ShowViews, show_nothing
 from sgsst_core.stylizing.views import ViewColors
 
 #: Maximum number of views whose Gram distance is measured, and of pairs compared per range.

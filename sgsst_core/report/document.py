@@ -20,11 +20,9 @@ from sgsst_core.progress import duration, percent
 from sgsst_core.quality.findings import Finding
 from sgsst_core.scales import ScaleWeights, predicted_fall, ratio, smoothed
 from sgsst_core.stylizing.checkpoint import versions
-from sgsst_core.stylizing.job import StylizationJob
+from sgsst_core.stylizing.job import StylizationJob, estimate
 from sgsst_core.stylizing.loop import Stopped
-from sgsst_core.stylizing.planner import estimate
-from sgsst_core.stylizing.steps import Evaluation, StepRecord, mean_loss, on_scales_of, relative_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Evaluation, StepRecord, Stylizer, mean_loss, on_scales_of, relative_loss
 
 #: Version of report.json, raised whenever a field is removed or changes its meaning.
 REPORT_VERSION = 4
@@ -164,7 +162,7 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
 
 def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
     """Return the style images that the job used, with their sizes and weights."""
-    style, regions, paths = stylizer.job.style, stylizer.job.regions, sources.styles
+    style, regions, paths = stylizer.job.styles.own, stylizer.job.styles.regions, sources.styles
     if regions is not None and not regions.mapped and regions.every[regions.active[0]].style is not None:
         paths = tuple(map(Path, style.names))  # a single active region with its own style covers the whole scene
     return [
@@ -175,7 +173,7 @@ def _styles_json(stylizer: Stylizer, sources: Sources) -> list[dict[str, Any]]:
 
 def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
     """Return the regions of the scene, background first; empty if there are none."""
-    regions = stylizer.job.regions
+    regions = stylizer.job.styles.regions
     if regions is None:
         return []
     weights = stylizer.job.plan.survey.total_blend_weights

@@ -9,10 +9,10 @@ import functools
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -24,18 +24,17 @@ from sgsst_core.features.vgg import EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE, EVEN_SCA
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.messages import from_json, to_json
 from sgsst_core.planning.plan import Plan
-from sgsst_core.regions import Regions
+from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.steps import StylizerState
+from sgsst_core.stylizing.stylizer import StylizerState
 
 T = TypeVar("T")
 
 #: Increased whenever the meaning of a stored value changes.
-FORMAT_VERSION = "10"
+FORMAT_VERSION = "11"
 #: Settings that may differ between a checkpoint and the run that resumes from it. They only end the run or select
 #: measurements; the memory limit, which determines the partition, changes only rounding.
 _FREE_SETTINGS = {"within", "fixed", "target_loss", "early_stop", "memory_limit", "measure"}
@@ -96,36 +95,28 @@ def fingerprint(
         weights: Digest of the feature network's weights.
         photos: Identifier of the content images; empty for unstylized renders.
     """
-    digest = hashlib.sha256(repr((weights, photos)).encode())
-    arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest)
-    for tensor in (*arrays, *style.images):
+    digest = hashlib.sha256(repr((weights, photos, scene.rendering)).encode())
+    for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest):
         digest.update(repr(tuple(tensor.shape)).encode())
         digest.update(tensor.contiguous().numpy().data)
-    if scene.rendering != CLASSIC:
-        digest.update(repr(scene.rendering).encode())
-    if len(style.images) > 1:
-        digest.update(repr(style.weights).encode())
-    if regions is not None:
-        _add_regions(digest, regions)
-    for camera in cameras:
-        pose = camera.world_to_camera.numpy().tobytes()
-        digest.update(repr((camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)).encode() + pose)
-        digest.update(repr(camera.lens).encode() if camera.lens else b"")
-    digest.update(settings.model_dump_json(exclude=_FREE_SETTINGS).encode())
-    if settings.feature_scale == "even":  # later versions may choose other factors, but a run must stay with one loss
-        digest.update(repr((EVEN_SCALE, EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE)).encode())
+    regions = regions and replace(regions, every=tuple(_unnamed(region) for region in regions.every))
+    unnamed, tensors = [replace(camera, name="") for camera in cameras], dict[str, Tensor]()
+    inputs = json.dumps(to_json((_plain(style), regions, unnamed), tensors))
+    # Later versions may choose other factors, but a run must stay with one loss.
+    even = repr((EVEN_SCALE, EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE)) if settings.feature_scale == "even" else ""
+    chosen = settings.model_dump_json(exclude=_FREE_SETTINGS)
+    digest.update(_digest(tensors, {"inputs": inputs, "settings": chosen, "even": even}).encode())
     return digest.hexdigest()
 
 
-def _add_regions(digest: Any, regions: Regions) -> None:
-    """Add the grouping and treatment of Gaussians to a digest, without the names of the regions."""
-    digest.update(regions.labels.contiguous().numpy().data)
-    for region in regions.every:
-        images, weights = (region.style.images, region.style.weights) if region.style else ((), ())
-        own = () if region.content_weight is None else (region.content_weight,)
-        digest.update(repr((region.freeze, region.weight, weights, *own)).encode())
-        for image in images:
-            digest.update(repr(tuple(image.shape)).encode() + image.contiguous().numpy().tobytes())
+def _plain(style: Style) -> Style:
+    """Return a style without names and notes."""
+    return replace(style, names=(), notes=())
+
+
+def _unnamed(region: Region) -> Region:
+    """Return what a region does to its Gaussians."""
+    return replace(region, name="", select="", selected=0, style=region.style and _plain(region.style))
 
 
 def save_plan(path: Path, plan: Plan, job: str, conditions: str) -> None:

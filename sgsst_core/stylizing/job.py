@@ -1,44 +1,69 @@
-"""Immutable context of a stylization: plan, settings and styles of a job, and the objects made from its inputs."""
+"""Context of a stylization: inputs of a job, its plan, the objects made from both, and an estimate of its time.
+
+`plan_job` surveys all views, makes the plan and prepares what it describes. Estimates and time budgets use the rate of
+the feature network on this machine, in pixels per second, which earlier jobs leave behind. It belongs to a device, a
+precision, a network and a style loss, and to a size of steps, because a GPU is slower at small ones.
+"""
 
 from __future__ import annotations
 
-import functools
-import itertools
+import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, TypeVar
 
-import scipy  # imports its modules at first use
+import numpy as np
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import Cache, forget_device_peak, memory_for
-from sgsst_core.devices import Timer
-from sgsst_core.errors import DeviceMemoryError, SettingsError
+from sgsst_core.budget import forget_device_peak, memory_for
+from sgsst_core.devices import Timer, wait_for
+from sgsst_core.errors import CameraError, DeviceMemoryError, OutputError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, weights_for
+from sgsst_core.features.weight_files import cache_folder
+from sgsst_core.files.atomic import write_json
 from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
-from sgsst_core.loss.terms import StyleTargets, ViewTarget, combined
-from sgsst_core.orbit import Orbit
-from sgsst_core.parallel import ALONE, Collectives, Size, Team
-from sgsst_core.planning.facts import PlanningContext, make_network, sharing_memory
-from sgsst_core.planning.plan import Plan, ends_with_transfer
-from sgsst_core.planning.time_budget import TimeChoice
-from sgsst_core.progress import Decision
+from sgsst_core.loss.terms import StyleTargets, ViewTarget
+from sgsst_core.orbit import Orbit, orbit_decisions
+from sgsst_core.parallel import ALONE, Collectives, Team
+from sgsst_core.planning.plan import (
+    Facts,
+    Plan,
+    PlanningContext,
+    check_scales,
+    choose_precision,
+    count_intersections,
+    count_weights,
+    ends_with_transfer,
+    equip,
+    is_weighted,
+    make_network,
+    make_plan,
+    sharing_memory,
+    with_groups,
+)
+from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
+from sgsst_core.planning.time_budget import Pace, SecondsLeft, TimeChoice, choosable, choose, ending_seconds
+from sgsst_core.progress import ANOTHER_LOSS, Decision
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.base import Color
 from sgsst_core.rasterizer.triton import CachedRasterizer
-from sgsst_core.refine import Refinement
-from sgsst_core.regions import ContentMaps, RegionMaps, Regions
-from sgsst_core.scene.camera import Camera, fit_cameras, spread
-from sgsst_core.scene.colors import ColorSubspace, color_subspace_of, style_size
+from sgsst_core.refine import Refinement, refine_decision
+from sgsst_core.regions import Regions, region_decisions
+from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
+from sgsst_core.scene.colors import color_subspace_of
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import MAX_RESOLUTION, Settings
+from sgsst_core.scene.spherical_harmonics import harmonics_energy
+from sgsst_core.settings import PlannedPrecision, Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.color_transfer import in_colors_of, in_luminance_of, luminance_start, warm_start
-from sgsst_core.stylizing.steps import Phase
+from sgsst_core.stylizing.styles import JobStyles
 from sgsst_core.stylizing.views import PhotoLoader, Views, ViewTargets
 
 T = TypeVar("T")
@@ -61,6 +86,9 @@ class JobInputs:
         about_inputs: Decisions about cameras and photos that start the plan.
         refinement: Refinement that produced the scene, for the plan to report; None if it was not refined.
         chosen: Choice of the time budget, to which `cameras` and `photos` belong (`choose_within`); None without one.
+
+    Raises:
+        CameraError: If there are no cameras.
     """
 
     scene: Scene
@@ -77,6 +105,10 @@ class JobInputs:
     refinement: Refinement | None = None
     chosen: TimeChoice | None = None
 
+    def __post_init__(self) -> None:
+        if not self.cameras:
+            raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
+
     def refined(self, refinement: Refinement | None, scene: Scene | None = None) -> JobInputs:
         """Return the inputs with their scene refined, unless `scene` is the refined scene."""
         if refinement is None:
@@ -86,199 +118,19 @@ class JobInputs:
 
 
 @dataclass(frozen=True)
-class JobStyles:
-    """Styles of a job, prepared as its settings require.
+class Phase:
+    """Phase of the schedule.
 
     Attributes:
-        own: Default style; if one region contains everything that the views show, the style of that region.
-        each: Style of each region in `Regions.active`; empty if views need no region maps.
-        content_weights: [N], content weight of each Gaussian; None for that of the settings everywhere.
+        stage: Name of the phase: "coarse" (phase 1, on the coarsest scale with a weight) or "sos" (phase 2, on all).
     """
 
-    own: Style
-    regions: Regions | None = None
-    each: tuple[Style, ...] = ()
-    content_weights: Tensor | None = None
+    stage: Literal["coarse", "sos"]
+    steps: int
 
-    @staticmethod
-    def prepared(
-        style: Style, regions: Regions | None, settings: Settings, sh_dc: Tensor, weights: Tensor
-    ) -> JobStyles:
-        """Prepare styles as the settings require; see `prepared_style`.
-
-        Args:
-            regions: Result of `Regions.resolved`; None if there are no regions.
-            sh_dc: [N, 3], colors of the scene. A region's style may be matched to the colors of the region's own
-                Gaussians.
-            weights: [N] float64, total blend weights.
-        """
-        if regions is None:
-            return JobStyles(prepared_style(style, settings, sh_dc, weights))
-        content_weights, labels = regions.content_weights(settings.content_weight), regions.style_labels
-        by_region = [regions.every[index].style or style for index in regions.active]
-        if not regions.mapped:
-            own = prepared_style(by_region[0], settings, sh_dc, weights)
-            return JobStyles(own, regions, content_weights=content_weights)
-        each = [
-            prepared_style(own, settings, sh_dc, torch.where(labels == index, weights, 0.0))
-            for index, own in zip(regions.active, by_region, strict=True)
-        ]
-        rest = each[regions.active.index(0)] if 0 in regions.active else prepared_style(style, settings, sh_dc, weights)
-        return JobStyles(rest, regions, tuple(each), content_weights=content_weights)
-
-    @property
-    def content_weight(self) -> float | None:
-        """Largest content weight of a Gaussian; None for that of the settings."""
-        return None if self.content_weights is None else float(self.content_weights.max())
-
-    def color_subspace(self, settings: Settings) -> ColorSubspace | None:
-        """Return the color subspace of the job; None if colors are free."""
-        return color_subspace_of(self.all, settings)
-
-    @property
-    def all(self) -> list[Style]:
-        """All distinct styles in use."""
-        styles: list[Style] = []
-        for style in self.each or (self.own,):
-            if all(style is not other for other in styles):
-                styles.append(style)
-        return styles
-
-    def to(self, device: torch.device) -> JobStyles:
-        """Return the styles with their images on a device."""
-
-        def move(style: Style) -> Style:
-            return style.map(lambda image: image.to(device))
-
-        return replace(self, own=move(self.own), each=tuple(map(move, self.each)))
-
-    def cached_targets(self, loss: SosLoss) -> Callable[[Camera], StyleTargets]:
-        """Return a function that returns the targets for views of a camera's size, computed at first use."""
-        styles = self.to(loss.network.device)
-        targets = functools.cache(functools.partial(styles.targets, loss))
-        return lambda camera: targets((camera.height, camera.width))
-
-    def targets(self, loss: SosLoss, view_size: Size) -> StyleTargets:
-        """Compute the targets for views of a size (height, width); see `TargetBuilder.of_style`."""
-        if not self.each:
-            return loss.targets.of_style(self.own, view_size)
-        assert self.regions is not None
-        weights = [self.regions.every[index].weight for index in self.regions.active]
-        targets = [loss.targets.of_style(style, view_size) for style in self.each]
-        return combined(targets, weights)
-
-    def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, preserve_chroma: bool = False) -> Tensor:
-        """Transfer to each Gaussian the colors of its region's style; see `warm_start`.
-
-        Args:
-            sh_dc: [n, 3], colors of some of the scene's Gaussians.
-            weights: [n] float64, total blend weights.
-            rows: [N] bool, mask of these Gaussians.
-            preserve_chroma: Whether to change luminance only.
-
-        Returns:
-            [n, 3].
-        """
-        transfer = luminance_start if preserve_chroma else warm_start
-        if not self.each:
-            return transfer(sh_dc, weights, self.own)
-        assert self.regions is not None
-        result, labels = sh_dc.clone(), self.regions.style_labels[rows]
-        for index, style in zip(self.regions.active, self.each, strict=True):
-            own = labels == index
-            if bool((weights[own] > 0).any()):
-                result[own] = transfer(sh_dc[own], weights[own], style)
-        return result
-
-    def maps(self, rasterizer: Rasterizer, rows: Tensor | None = None) -> RegionMaps | None:
-        """Return the renderer of the maps of regions; None if the views need none.
-
-        Args:
-            rows: [N] bool, Gaussians that the rasterizer contains; None for all.
-        """
-        if not self.each:
-            return None
-        assert self.regions is not None
-        labels = self.regions.style_labels if rows is None else self.regions.style_labels[rows]
-        return RegionMaps(labels, self.regions.active, rasterizer)
-
-    def content_maps(self, rasterizer: Rasterizer, rows: Tensor | None = None) -> ContentMaps | None:
-        """Return the renderer of content weights; None if they are the same everywhere. See `maps` for arguments."""
-        if not self.content_weight or self.content_weights is None:
-            return None
-        return ContentMaps(self.content_weights if rows is None else self.content_weights[rows], rasterizer)
-
-
-def prepared_style(style: Style, settings: Settings, sh_dc: Tensor, weights: Tensor) -> Style:
-    """Prepare a style as the settings require. If they require nothing, return the style itself.
-
-    Args:
-        style: Images [H, W, 3] in 0..1.
-        sh_dc: [N, 3], colors of the scene.
-        weights: [N] float64, total blend weights, at least one positive.
-    """
-    if settings.style_rotation:
-        style = style.map(lambda image: rotated(image, settings.style_rotation))
-    if settings.preserve_colors == "match":
-        # Gatys, Ecker, Bethge, Hertzmann, Shechtman, "Controlling Perceptual Factors in Neural Style Transfer", CVPR
-        # 2017, section 5.2.
-        style = in_colors_of(style, sh_dc, weights)
-    elif settings.preserve_colors == "luminance":
-        style = in_luminance_of(style, sh_dc, weights)  # section 5.1 of the same paper
-    return style
-
-
-def check_style_size(style: Style, cameras: Sequence[Camera], scale: float) -> None:
-    """Check that no view requires a style image with a longer side of more than `MAX_RESOLUTION` pixels.
-
-    Raises:
-        SettingsError: If an image would be larger.
-    """
-    if scale <= 1:
-        return
-    sizes = {(camera.height, camera.width) for camera in cameras}
-    for size, image in itertools.product(sizes, style.images):
-        height, width = style_size((image.shape[0], image.shape[1]), size, scale)
-        if max(height, width) > MAX_RESOLUTION:
-            raise SettingsError(
-                f"--style-scale {scale:g} would make the style image {width:,} x {height:,} pixels for views of "
-                f"{size[1]} x {size[0]}. Its longer side must be at most {MAX_RESOLUTION:,}. Use a smaller scale."
-            )
-
-
-def rotated(style: Tensor, degrees: float) -> Tensor:
-    """Rotate an image [H, W, 3] counterclockwise, and crop it to the largest upright rectangle inside.
-
-    Quarter turns are exact. Other angles are interpolated (cubic splines) and clamped to 0..1.
-    """
-    quarters, rest = divmod(degrees, 90)
-    style = torch.rot90(style, int(quarters) % 4, (0, 1)).contiguous()
-    if not rest:
-        return style
-    height, width = style.shape[:2]
-    spun = scipy.ndimage.rotate(style.double().numpy(), rest, axes=(1, 0), reshape=True, order=3, mode="nearest")
-    inner_height, inner_width = _inside(height, width, math.radians(rest))
-    top, left = (spun.shape[0] - inner_height) // 2, (spun.shape[1] - inner_width) // 2
-    cropped = spun[top : top + inner_height, left : left + inner_width]
-    return torch.from_numpy(cropped).clamp(0, 1).to(style.dtype).contiguous()
-
-
-def _inside(height: int, width: int, angle: float) -> tuple[int, int]:
-    """Return the sides of the largest upright rectangle inside one that is rotated by 0 to pi/2; at least 1.
-
-    If the rotated rectangle is narrow, two corners of the result lie on one of its long sides, and half of its short
-    side is the limit. Otherwise, each corner of the result lies on a different side.
-    """
-    sine, cosine = math.sin(angle), math.cos(angle)
-    shorter, longer = min(height, width), max(height, width)
-    if shorter <= 2 * sine * cosine * longer:
-        half = shorter / 2
-        across, down = (half / sine, half / cosine) if width >= height else (half / cosine, half / sine)
-    else:
-        spread = cosine * cosine - sine * sine
-        across, down = (width * cosine - height * sine) / spread, (height * cosine - width * sine) / spread
-    # One pixel less on each side, where the interpolation reads beyond the image.
-    return max(int(down) - 2, 1), max(int(across) - 2, 1)
+    def scales(self, chosen: Sequence[int]) -> list[int]:
+        """Return the scales to optimize, given a view's scales with a positive weight (`chosen`), finest first."""
+        return list(chosen if self.stage == "sos" else chosen[-1:])
 
 
 @dataclass(frozen=True)
@@ -313,34 +165,14 @@ class StylizationJob:
     survey_seconds: float = 0.0
 
     @property
-    def style(self) -> Style:
-        """Style of all Gaussians that are not in a region with its own style."""
-        return self.styles.own
-
-    @property
-    def regions(self) -> Regions | None:
-        """Regions with their own style, or frozen; None for one style everywhere."""
-        return self.styles.regions
-
-    @property
     def collectives(self) -> Collectives:
         """All ranks that take part."""
         return self.team.everybody
 
     @property
-    def group(self) -> Collectives:
-        """Ranks that process the same views as this one."""
-        return self.team.group
-
-    @property
-    def timer(self) -> Timer:
-        """Timer of the activities of a step."""
-        return self.loss.timer
-
-    @property
     def schedule(self) -> list[Phase]:
         """The two phases of every preset."""
-        return [Phase("coarse", self.plan.steps_coarse, 0), Phase("sos", self.settings.steps_sos)]
+        return [Phase("coarse", self.plan.steps_coarse), Phase("sos", self.settings.steps_sos)]
 
     @property
     def total_steps(self) -> int:
@@ -370,11 +202,6 @@ class StylizationJob:
         """Whether only luminance changes."""
         return self.settings.preserve_colors == "luminance"
 
-    @property
-    def caches(self) -> dict[str, Cache[Any, Any]]:
-        """Caches of data of the views by name, "weights" before "intersections"."""
-        return {**self.views.caches, **self.view_targets.caches}
-
     def gradient(
         self,
         index: int,
@@ -391,15 +218,15 @@ class StylizationJob:
             scales: Scales to evaluate; a mapping gives their weights (`SosLoss.evaluate`).
             background: Background color; None for that of the settings.
         """
-        with self.timer("render"), torch.no_grad():
+        with self.loss.timer("render"), torch.no_grad():
             colors = self.views.colors(index, sh_dc)
             image = self.views.render(index, colors)
             if background is not None:
                 image = self.view_targets.replace_background(index, image, background)
-        with self.timer("loss"):
+        with self.loss.timer("loss"):
             evaluate = self.graphs.evaluate if self.graphs is not None else self.loss.evaluate
             result = evaluate(image, style, target, scales)
-        with self.timer("raster_backward"):
+        with self.loss.timer("raster_backward"):
             assert result.image_gradient is not None
             return self.views.gradient(index, result.image_gradient.to(colors.device), colors), result
 
@@ -407,6 +234,148 @@ class StylizationJob:
         """Return the scales of a view with a positive weight, finest first."""
         camera = self.views.cameras[index]
         return self.loss.tiling.scales((camera.height, camera.width))
+
+
+# --- planning ------------------------------------------------------------------------------------------------------
+
+#: Longer side in pixels of the views that a time budget is chosen from, and their number.
+_SMALL_SIDE, _SMALL_VIEWS = 256, 4
+
+
+def plan_job(
+    inputs: JobInputs,
+    *,
+    collectives: Collectives = ALONE,
+    plan: Plan | None = None,
+    survey: Survey | None = None,
+    groups: int | None = None,
+    show: ShowPlanning | None = None,
+    timer: Timer | None = None,
+) -> StylizationJob:
+    """Plan and prepare a job. Every rank must call this with the same arguments, and gets the same plan.
+
+    Args:
+        plan: Plan from an earlier run of the same job, which is used unchanged; None to make one.
+        survey: Survey from an earlier plan of the same job; None to survey the views.
+        groups: `Plan.groups` of an earlier plan of the same job; None to choose them.
+        show: Callback for the progress of the survey.
+        timer: Timer that records the survey as "survey", other planning as "planning", and the preparation of the job
+            as "preparing".
+
+    Raises:
+        CameraError: If no camera sees a Gaussian.
+        SettingsError: If regions freeze everything visible, views lack requested scales, or the rasterizer or the
+            precision does not work here.
+    """
+    timer, chosen, context = timer or Timer(), inputs.chosen, None
+    settings = chosen.applied(inputs.settings) if chosen else inputs.settings
+    if plan is None:
+        with timer("planning"):
+            fitted = fit_cameras(inputs.cameras, settings)
+            check_scales(settings.scales, fitted, settings.coarsest_side)
+            weights = weights_for(inputs.weights, settings)
+            context = equip(inputs.scene, fitted, settings, weights, collectives, inputs.rasterizer)
+            if survey is None:
+                with timer("survey"):
+                    survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
+            about = [*_about_inputs(inputs, settings, survey, fitted)]
+            facts = collectives.broadcast(lambda: _facts(context, survey, inputs))
+            plan = make_plan(facts, settings, groups=groups, measured=inputs.measured, about=about)
+            plan = replace(plan, refinement=inputs.refinement, time_choice=chosen)
+    if chosen and not plan.steps_coarse:  # so that the learning rate falls alike for any number of steps
+        settings = settings.with_steps(0, settings.steps_sos)
+    with timer("preparing"):
+        inputs = replace(inputs, settings=with_groups(settings, plan.groups))
+        job = prepare_job(plan, inputs, collectives=collectives, planning_context=context)
+    surveyed = timer.seconds.get("survey", 0.0) * collectives.size
+    return replace(job, survey_seconds=surveyed / len(inputs.cameras))
+
+
+def choose_within(inputs: JobInputs, left: SecondsLeft, collectives: Collectives = ALONE) -> TimeChoice | None:
+    """Choose what fits a time budget, from a survey of a few small views. Every rank must call this function.
+
+    Args:
+        left: Seconds left of the budget.
+
+    Returns:
+        The choice; None if the settings give everything.
+    """
+    settings = inputs.settings
+    if not choosable(settings):
+        return None
+    fitted, weights = fit_cameras(inputs.cameras, settings), weights_for(inputs.weights, settings)
+    small = [resized(each, min(_SMALL_SIDE, each.side)) for each in spread(fitted, _SMALL_VIEWS)]
+    context = equip(inputs.scene, small, settings, weights, collectives, inputs.rasterizer)
+    precision, ranks = choose_precision(settings, context.machine), collectives.size
+
+    def choice() -> TimeChoice:
+        rates = Rates(context.network(precision), precision, settings)
+        context.rasterizer.survey(small[0])  # the first pass starts libraries and compiles kernels
+        context.rasterizer.forget_views()
+        started = time.perf_counter()
+        survey = survey_views(context.scene, small, context.rasterizer)
+        seconds = (time.perf_counter() - started) / len(small)
+        areas = [camera.width * camera.height for camera in small]
+        weighted = is_weighted(survey, settings)
+        passed = [survey.regions[index].pixels if weighted else areas[index] for index in survey.covered]
+        portion = sum(passed) / sum(areas[index] for index in survey.covered)
+        pace = Pace(lambda pixels: ranks * rates.rate(pixels / ranks), seconds, sum(areas) / len(areas), portion)
+        return choose(fitted, settings, pace, left(), len(inputs.scene))
+
+    return collectives.broadcast(choice)
+
+
+def _facts(context: PlanningContext, survey: Survey, inputs: JobInputs) -> Facts:
+    """Gather the facts on which the plan depends; one rank does this for all."""
+    scene, settings, machine = context.scene, context.settings, context.machine
+    views = [context.cameras[index] for index in survey.covered]
+    precision = choose_precision(settings, machine)
+    network = context.network(precision)
+    return Facts(
+        gaussians=len(scene),
+        sh_degree=inputs.scene.sh_degree,
+        used_degree=scene.used_degree(survey.total_blend_weights > 0),
+        harmonics_energy=harmonics_energy(scene, survey.total_blend_weights),
+        sizes=tuple((camera.height, camera.width) for camera in context.cameras),
+        survey=survey,
+        machine=machine,
+        rasterizer=context.rasterizer.name,
+        precision=precision,
+        tiling=make_loss(network, settings, memory_for("activations", machine.memory)).tiling,
+        pixel_bytes=network.held_bytes_per_pixel(),
+        weight_bytes=count_weights(context.rasterizer, views),
+        intersection_bytes=count_intersections(context.rasterizer, len(views)),
+        frozen=inputs.regions and inputs.regions.resolved(survey.total_blend_weights).frozen,
+    )
+
+
+def _about_inputs(
+    inputs: JobInputs, settings: Settings, survey: Survey, fitted: Sequence[Camera]
+) -> Iterator[Decision]:
+    """Yield the decisions about the inputs: cameras, time budget, refinement, orbit, regions and styles."""
+    yield from inputs.about_inputs
+    if inputs.chosen:
+        yield inputs.chosen.decision(inputs.settings.within, settings.steps_coarse + settings.steps_sos)
+    if inputs.refinement is not None:
+        yield refine_decision(inputs.refinement, settings)
+    if inputs.orbit is not None:
+        yield from orbit_decisions(inputs.orbit, len(fitted))
+    style, regions = inputs.style, inputs.regions
+    if regions is not None:
+        yield from region_decisions(regions, survey.total_blend_weights)
+    own = [region.style for region in regions.every if region.style] if regions else []
+    for each in (style, *own):
+        yield from (Decision("style", "warning", note) for note in each.notes)
+    if subspace := color_subspace_of((style, *own), settings):
+        form = "a plane" if subspace.dimensions == 2 else "a line"
+        reason = f"the style's colors differ from it by {255 * subspace.deviation:.1f} of 255 levels"
+        yield Decision("color subspace", f"colors stay on {form} in RGB", reason, error=ANOTHER_LOSS)
+    if len(style.images) > 1:
+        given = f"{len(style.images)} images were given"
+        yield Decision("styles", f"a mixture: {style.text}", given, error=ANOTHER_LOSS)
+
+
+# --- preparation ---------------------------------------------------------------------------------------------------
 
 
 def prepare_job(
@@ -463,7 +432,7 @@ def prepare_job(
         timer=loss.timer,
     )
     if plan.spare:
-        views.caches["intersections"].limit(memory_for("rasterizer", memory) + plan.spare // 2)
+        rasterizer.caches["intersections"].limit(memory_for("rasterizer", memory) + plan.spare // 2)
     view_targets = ViewTargets(
         views,
         loss,
@@ -512,12 +481,11 @@ def _make_rasterizer(
 ) -> Rasterizer:
     """Return the plan's rasterizer of the rendered Gaussians."""
     budget = memory_for("rasterizer", memory)
-    if planning_context and plan.seen.all():
-        uncached = planning_context.rasterizer
-    else:
-        uncached = make_rasterizer(
-            plan.uncached, rendered, background=settings.background, near=settings.near, memory=budget
-        )
+    uncached = (
+        planning_context.rasterizer
+        if planning_context and plan.seen.all()
+        else make_rasterizer(plan.uncached, rendered, background=settings.background, near=settings.near, memory=budget)
+    )
     if plan.cached_weights == "none":
         return uncached
     return CachedRasterizer(
@@ -532,12 +500,9 @@ def _make_rasterizer(
 
 def view_memory(plan: Plan, memory: int) -> int:
     """Return the budget in bytes for data of the views: what other caches leave of it, and half of `Plan.spare`."""
-    left = memory_for("views", memory) + plan.spare // 2
-    if plan.cached_weights != "none":
-        left -= memory_for("intersections", memory)
-    if plan.measured:
-        left -= (2 if plan.is_approximated else 1) * memory_for("measuring", memory)
-    return left
+    measuring = (1 + plan.is_approximated) * plan.measured * memory_for("measuring", memory)
+    cached = (plan.cached_weights != "none") * memory_for("intersections", memory)
+    return memory_for("views", memory) + plan.spare // 2 - cached - measuring
 
 
 def with_second_attempt(job: StylizationJob, work: Callable[[], T]) -> T:
@@ -573,3 +538,103 @@ def _not_enough(job: StylizationJob, attempt: str) -> DeviceMemoryError:
         f"other programs on this GPU, or give a smaller --memory-limit than {job.memory_limit / 1e9:.1f} GB or a "
         "smaller --resolution (`max_resolution` in Python)."
     )
+
+
+# --- estimates -----------------------------------------------------------------------------------------------------
+
+#: Activities of a step that pass pixels through the network.
+NETWORK_PARTS = ("vgg_forward", "vgg_backward", "statistics", "matching", "network")
+#: Sides of the image that a machine without a remembered rate is tried on: first one that compiles kernels.
+_SIDES: dict[str, tuple[int, int]] = {"cpu": (32, 96), "cuda": (64, 512)}
+#: Weight of the latest job in a remembered rate.
+_LATEST = 0.5
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """About how long a job takes, until its own pace is known.
+
+    Attributes:
+        seconds: Seconds of a mean step on all scales.
+        seconds_coarse: Seconds of a step of phase 1.
+        measuring: Seconds of all measurements.
+        ending: Seconds from the last step to the last file, except for measurements.
+        job: Seconds of all steps and measurements.
+    """
+
+    seconds: float
+    seconds_coarse: float
+    measuring: float
+    ending: float
+    job: float
+
+
+def estimate(job: StylizationJob) -> Estimate:
+    """Estimate the seconds of a job from the rate that earlier jobs have left behind, and from its survey."""
+    plan, settings, cameras = job.plan, job.settings, [job.views.cameras[index] for index in job.views.covered]
+    pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
+    pace = Pace(Rates(job.network, plan.precision, settings).rate, job.survey_seconds, pixels)
+    views = settings.views_per_step / plan.ranks
+    sos, coarse = (pace.step(work, pixels, views) for work in (plan.work.sos, plan.work.coarse))
+    measuring = plan.work.measuring / pace.rate(plan.work.sos)
+    seconds = plan.steps_coarse * coarse + settings.steps_sos * sos + measuring
+    return Estimate(sos, coarse, measuring, ending_seconds(len(job.scene)), min(seconds, settings.within or seconds))
+
+
+class Rates:
+    """Rates of a network on the device of a job, by the number of pixels in a step."""
+
+    def __init__(self, network: FeatureNetwork, precision: PlannedPrecision, settings: Settings) -> None:
+        device = network.device
+        name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{torch.get_num_threads()} threads"
+        self._network, self._settings = network, settings
+        size = f"{network.name} of {network.held_bytes_per_pixel():.0f} bytes per pixel"
+        self._key = f"{name}, {precision}, {size}, {settings.style_loss}"
+        self._path = cache_folder() / "rates.json"
+
+    def rate(self, pixels: float) -> float:
+        """Return the rate of steps with so many pixels, between remembered ones; that of a small image without any."""
+        known = {int(size): rate for size, rate in _read(self._path).get(self._key, {}).items()}
+        sizes = sorted(known)
+        if not sizes:
+            return self._tried
+        return float(np.interp(math.log2(max(pixels, 1.0)), sizes, [known[size] for size in sizes]))
+
+    def remember(self, pixels: float, rate: float) -> None:
+        """Remember the rate of a job's steps; one that cannot be written is forgotten."""
+        rates, size = _read(self._path), _size(pixels)
+        own = rates.setdefault(self._key, {})
+        own[size] = math.exp((1 - _LATEST) * math.log(own.get(size, rate)) + _LATEST * math.log(rate))
+        with suppress(OSError, OutputError):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(self._path, rates)
+
+    @cached_property
+    def _tried(self) -> float:
+        """Return the rate of one pass over a small image, in less than half a second."""
+        settings, seconds = self._settings.model_copy(update={"scales": ()}), 1.0
+        loss = make_loss(self._network, settings, 1 << 40, content_weight=0)
+        for side in _SIDES[self._network.device.type]:
+            image = torch.rand((side, side, 3), generator=torch.Generator().manual_seed(0)).to(self._network.device)
+            style, view = loss.targets.of_style(Style.of(image.cpu()), (side, side)), loss.targets.of_view(image)
+            started = time.perf_counter()
+            loss.evaluate(image, style, view, [0])
+            wait_for(self._network.device)
+            seconds = time.perf_counter() - started
+        return side * side / seconds
+
+
+def _size(pixels: float) -> str:
+    return str(round(math.log2(max(pixels, 1.0))))
+
+
+def _read(path: Path) -> dict[str, dict[str, float]]:
+    """Return the remembered rates; none if there is no file or it cannot be used."""
+    try:
+        stored = json.loads(path.read_text("utf-8"))
+        return {
+            key: {str(int(size)): float(rate) for size, rate in own.items() if 0 < float(rate) < math.inf}
+            for key, own in stored.items()
+        }
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}

@@ -23,16 +23,14 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import F, as_scene, stylized
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.planning.time_budget import SecondsLeft, ending_seconds
-from sgsst_core.progress import Progress
+from sgsst_core.progress import Progress, job_bar
 from sgsst_core.scales import has_converged, has_reached, window_length
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.rendering import RenderMode
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.planner import NETWORK_PARTS, Rates, estimate
-from sgsst_core.stylizing.progress_bar import JobBar, job_bar
-from sgsst_core.stylizing.steps import Evaluation, mean_loss, round_evaluation, round_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.job import NETWORK_PARTS, Rates, estimate
+from sgsst_core.stylizing.stylizer import Evaluation, Stylizer, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.views import PhotoLoader
 
 #: Number of latest steps that the remaining time follows from, and number from which on it does.
@@ -220,7 +218,7 @@ def _end_requested(stylizer: Stylizer, callbacks: Callbacks, first: int, pace: _
         return "on-request"
     if callbacks.left is None:
         return None
-    coarse, left = stylizer.phase.scale is not None, callbacks.left()
+    coarse, left = stylizer.phase.stage == "coarse", callbacks.left()
     if stylizer.step == first + 1 and left > 0:
         return None
     return "within" if left <= pace.step_seconds(coarse=coarse, least=1) + pace.ending_seconds() else None
@@ -242,7 +240,7 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
             # is evaluated at the end of each round, in the same way as the initial loss.
             losses = []
             if not stylizer.step % stylizer.job.round_length:
-                with stylizer.measuring():
+                with stylizer.timed("measuring"):
                     loss = mean_loss(stylizer.evaluate(stylizer.job.evaluation_views), stylizer.job.loss.weights)
                 losses = [loss] * stylizer.job.round_length
         if has_reached(losses, target, stylizer.job.round_length):
@@ -293,10 +291,8 @@ def _by_scale(evaluation: Evaluation) -> list[float | None]:
 
 def _timed(stylizer: Stylizer, part: str, action: Callable[[Stylizer], None]) -> None:
     """Call an action between steps, and record its time as a part of the job's."""
-    started = time.perf_counter()
-    action(stylizer)
-    parts = stylizer.seconds_by_part
-    parts[part] = parts.get(part, 0.0) + time.perf_counter() - started
+    with stylizer.timed(part):
+        action(stylizer)
 
 
 def stylize(
@@ -352,23 +348,17 @@ def stylize(
         job = stylizer.job
         if isinstance(scene, SceneFile):
             scene.refined(job.plan.refinement)  # raises before the steps if the file cannot hold the result
-        callbacks = callbacks or Callbacks()
-        run(stylizer, _shown(bar, replace(callbacks, left=callbacks.left or left)))
+        own = callbacks or Callbacks()
+
+        def report(now: Progress) -> None:
+            if show:
+                show(now)
+            if own.progress:
+                own.progress(now)
+
+        run(stylizer, replace(own, progress=report, left=own.left or left))
     result = replace(job.scene, sh_dc=stylizer.stylized())
     return cast(F, stylized(scene, result, job.plan.refinement, chosen.sh_attenuation))
-
-
-def _shown(bar: JobBar | None, callbacks: Callbacks) -> Callbacks:
-    """Return callbacks that update a progress bar, if there is one, and call the given ones."""
-    if bar is None:
-        return callbacks
-
-    def show(progress: Progress) -> None:
-        bar.show(progress)
-        if callbacks.progress:
-            callbacks.progress(progress)
-
-    return replace(callbacks, progress=show)
 
 
 Stopped = Literal["finished", "within", "target-loss", "converged", "on-request", "interrupted"]

@@ -8,11 +8,10 @@ gradient shows where texture is needed.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -21,10 +20,10 @@ from sgsst_core.budget import memory_for
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.vgg import weights_for
 from sgsst_core.loss.sos import make_loss
-from sgsst_core.loss.terms import StyleTargets, ViewTarget
+from sgsst_core.loss.terms import ViewTarget
 from sgsst_core.parallel import ALONE, Collectives
-from sgsst_core.planning.facts import PlanningContext, equip
-from sgsst_core.planning.survey import ShowPlanning, progress_of, psnr, sees_something
+from sgsst_core.planning.plan import PlanningContext, equip
+from sgsst_core.planning.survey import ShowPlanning, progress_of, psnr, survey_views
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.refine import (
@@ -40,12 +39,12 @@ from sgsst_core.refine import (
     piece_counts,
     split,
 )
-from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.camera import Camera, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.style import Style
-from sgsst_core.stylizing.color_transfer import with_moments
-from sgsst_core.stylizing.job import JobInputs, prepared_style
+from sgsst_core.stylizing.job import JobInputs
+from sgsst_core.stylizing.styles import JobStyles, prepared_style, with_moments
 
 #: Number of evenly spread views whose gradient is computed; each costs an iteration.
 GRADIENT_VIEWS = 24
@@ -125,9 +124,10 @@ class _Refining:
         count = len(self._scene)
         nothing = Refinement(torch.ones((count, 3), dtype=torch.uint8), 0, count)
         lengths, finest = self._footprints.lengths, finest_size(self._settings)
-        if not covered or not self._collectives.broadcast(lambda: bool((lengths > finest).any())):
+        if not self._collectives.broadcast(lambda: bool((lengths > finest).any())):
             return nothing
-        cancels, magnitude = self._gradient_disagreement(spread_evenly(covered, GRADIENT_VIEWS))
+        views = spread(covered, GRADIENT_VIEWS)
+        cancels, magnitude = self._gradient_disagreement(views)
         sane = can_be_split(self._scene)
         sane = sane if self._frozen is None else sane & ~self._frozen
         allowed = candidates(self._footprints, sane, cancels, magnitude)
@@ -136,10 +136,9 @@ class _Refining:
             lambda: choose_pieces(lengths, allowed, cancels, most, budget, finest)
         )
         chosen = int((piece_counts(pieces) > 1).sum())
-        fitted = spread_evenly(covered, GRADIENT_VIEWS)
         if self._show:
             self._show(Progress(stage="refining"))
-        pieces, change = self._undo_until_images_are_preserved(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))
+        pieces, change = self._undo_until_images_are_preserved(pieces, views, spread(covered, MEASURED_VIEWS))
         counts = piece_counts(pieces)
         parents = int((counts > 1).sum())
         if change is None:
@@ -162,46 +161,41 @@ class _Refining:
             change = self._change(pieces, fitted, views)
             if change.lowest >= MIN_PSNR:
                 return pieces, change
-            pieces = self._collectives.broadcast(partial(self._undo_the_worst, pieces, change))
+            pieces = self._collectives.broadcast(functools.partial(self._undo_the_worst, pieces, change))
         return torch.ones_like(pieces), None
 
     def _survey(self) -> list[int]:
         """Survey every view, and return those that see anything."""
-        collectives, cameras = self._collectives, self._planning_context.cameras
-        covered = []
-        for index in self._shown(range(len(cameras)), "planning"):
-            coverage, weights = self._rasterizer.survey(cameras[index])
-            if sees_something(coverage):
-                covered.append(index)
-                self._footprints.add(cameras[index], weights.cpu())
-        sums, reach = self._footprints.sums
-        every = torch.stack(collectives.all_gather(reach)).amax(dim=0) if collectives.size > 1 else reach
-        self._footprints.replace(self._sum(sums), every)
-        return sorted(index for views in collectives.all_gather(covered) for index in views)
+        collectives, context = self._collectives, self._planning_context
+
+        def visit(camera: Camera, weights: Tensor) -> None:
+            self._footprints.add(camera, weights.cpu())
+
+        survey = survey_views(self._scene, context.cameras, self._rasterizer, collectives, self._show, visit)
+        self._footprints.sums = self._sum(self._footprints.sums)
+        self._footprints.reach = torch.stack(collectives.all_gather(self._footprints.reach)).amax(dim=0)
+        return survey.covered
 
     def _gradient_disagreement(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return the sum over some views of the `disagreement` of the style loss gradient."""
-        settings, cameras, total = self._settings, self._planning_context.cameras, self._footprints.weights
+        settings, total = self._settings, self._footprints.weights
         network = self._planning_context.network()
         style = prepared_style(self._given, settings, self._scene.sh_dc, total)
-        style = style.map(lambda image: image.to(network.device))
         scene = replace(self._scene, sh_dc=with_moments(self._scene.sh_dc, total, style))
         loss = make_loss(
             network,
             settings.model_copy(update={"content_weight": 0.0}),
             memory_for("activations", self._planning_context.machine.memory),
         )
-        targets: dict[tuple[int, int], StyleTargets] = {}
+        targets = JobStyles(style).cached_targets(loss)
         sums = torch.zeros((len(scene), 2), dtype=torch.float64)
-        for index in self._shown(views, "refining"):
-            camera = cameras[index]
-            size = (camera.height, camera.width)
-            if size not in targets:
-                targets[size] = loss.targets.of_style(style, size)
+        for done, (_, camera) in enumerate(self._of_this_rank(views)):
+            if self._show:
+                self._show(progress_of(done, len(views), self._collectives.size, "refining"))
             image = render(scene, self._rasterizer, camera)
             weighted = settings.position_weights != "off"
             weights = loss.targets.position_weights(self._rasterizer.coverage(camera)) if weighted else None
-            gradient = loss.evaluate(image, targets[size], ViewTarget(coverage=weights)).image_gradient
+            gradient = loss.evaluate(image, targets(camera), ViewTarget(coverage=weights)).image_gradient
             assert gradient is not None
             gradient = gradient.to(self._rasterizer.device, self._rasterizer.dtype)
             sums += torch.stack(disagreement(self._rasterizer, camera, gradient), dim=1)
@@ -215,8 +209,7 @@ class _Refining:
         scene = self._fit(scene, rasterizer, (piece_counts(pieces) > 1)[parents_of(pieces)], fitted)
         squared = torch.zeros(len(self._scene), dtype=torch.float64)
         errors: dict[int, float] = {}
-        for index in self._of_this_rank(views):
-            camera = self._planning_context.cameras[index]
+        for index, camera in self._of_this_rank(views):
             before = render(self._scene, self._rasterizer, camera).clamp(0, 1)
             change = (render(scene, rasterizer, camera).clamp(0, 1) - before).square()
             errors[index] = float(change.mean(dtype=torch.float64))
@@ -234,8 +227,7 @@ class _Refining:
         children = children.to(self._rasterizer.device)
         for _ in range(_FITTING_STEPS):
             lacks = torch.zeros((len(scene), 4), dtype=torch.float64, device=self._rasterizer.device)
-            for index in self._of_this_rank(views):
-                camera = self._planning_context.cameras[index]
+            for _, camera in self._of_this_rank(views):
                 missing = render(self._scene, self._rasterizer, camera) - render(scene, rasterizer, camera)
                 lacks[:, :3] += rasterizer.color_gradient(missing, camera)
                 lacks[:, 3] += rasterizer.survey(camera)[1]
@@ -256,16 +248,10 @@ class _Refining:
         fewer[worst] = 1
         return fewer
 
-    def _of_this_rank(self, views: Sequence[int]) -> Sequence[int]:
-        """Return the views that this rank processes."""
-        return views[self._collectives.rank :: self._collectives.size]
-
-    def _shown(self, views: Sequence[int], stage: Literal["planning", "refining"]) -> Iterator[int]:
-        """Yield the views that this rank processes, one by one, and report progress."""
-        for done, index in enumerate(self._of_this_rank(views)):
-            if self._show:
-                self._show(progress_of(done, len(views), self._collectives.size, stage))
-            yield index
+    def _of_this_rank(self, views: Sequence[int]) -> list[tuple[int, Camera]]:
+        """Return the views that this rank processes, with their cameras."""
+        own = views[self._collectives.rank :: self._collectives.size]
+        return [(index, self._planning_context.cameras[index]) for index in own]
 
     def _sum(self, values: Tensor) -> Tensor:
         """Return the sum over all ranks."""
@@ -288,9 +274,3 @@ def disagreement(rasterizer: Rasterizer, camera: Camera, image_gradient: Tensor)
 def render(scene: Scene, rasterizer: Rasterizer, camera: Camera) -> Tensor:
     """Return the image [H, W, 3] of a scene, using a rasterizer with its geometry."""
     return rasterizer.render(scene_colors(scene, camera, rasterizer.device), camera)
-
-
-def spread_evenly(views: Sequence[int], most: int) -> list[int]:
-    """Return at most `most` views, evenly spread and including the first."""
-    count = min(most, len(views))
-    return [views[index * len(views) // count] for index in range(count)]

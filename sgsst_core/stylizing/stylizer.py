@@ -6,15 +6,15 @@ after it has queued the next one, so that the GPU does not wait for the host.
 
 from __future__ import annotations
 
+import hashlib
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 import psutil
-import scipy  # imports its modules at first use
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -26,37 +26,31 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
+from sgsst_core.loss.terms import LossTerms, StyleTargets
 from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions import Regions
+from sgsst_core.scales import EVEN, ScaleWeights, ratio, smoothed
 from sgsst_core.scene.camera import Camera, checked_cameras
-from sgsst_core.scene.colors import ColorSubspace, on_screen, on_screen_by_luminance, with_chroma_of
+from sgsst_core.scene.colors import ColorSubspace
 from sgsst_core.scene.gaussians import Scene, checked_scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, image_of
-from sgsst_core.stylizing.job import JobInputs, JobStyles, StylizationJob, in_bfloat16, with_second_attempt
-from sgsst_core.stylizing.planner import choose_within, plan_job
-from sgsst_core.stylizing.refining import refine
-from sgsst_core.stylizing.steps import (
-    BEFORE_STEPS,
-    Evaluation,
+from sgsst_core.stylizing.job import (
+    JobInputs,
     Phase,
-    ShowViews,
-    StepRecord,
-    StylizerState,
-    ViewOrder,
-    completed,
-    drawn_scales,
-    evaluate,
-    mean_evaluation,
-    mean_loss,
-    phase_at,
-    show_nothing,
+    StylizationJob,
+    choose_within,
+    in_bfloat16,
+    plan_job,
+    with_second_attempt,
 )
-from sgsst_core.stylizing.views import PhotoLoader, drawn_color
+from sgsst_core.stylizing.refining import refine
+from sgsst_core.stylizing.styles import JobStyles, constrained, neighbors_change
+from sgsst_core.stylizing.views import PhotoLoader, ViewTargets, drawn_color
 
 #: Adam's epsilon: practically zero, so that Gaussians of any blend weight move at the learning rate (SGSST).
 ADAM_EPS = 1e-15
@@ -172,35 +166,9 @@ class ColorOptimizer:
         self._second.copy_(second)
 
 
-def constrained(
-    colors: Tensor, chroma_of: Tensor | None, subspace: ColorSubspace | None = None, *, bounded: bool
-) -> Tensor:
-    """Project DC coefficients [n, 3] to their constraints, without accumulating rounding errors in their chroma.
-
-    Args:
-        colors: [n, 3].
-        chroma_of: [n, 3], colors whose chroma is preserved; None if chroma may change.
-        subspace: Color subspace that colors are projected to; they leave it where it leaves the range. None for any
-            color.
-        bounded: Whether colors must be in 0..1.
-    """
-    colors = colors if subspace is None else subspace.projected(colors)
-    if chroma_of is None:
-        return on_screen(colors) if bounded else colors
-    return with_chroma_of(on_screen_by_luminance(colors) if bounded else colors, chroma_of)
-
-
 def is_too_large(largest: float) -> bool:
     """Return whether a gradient with this largest magnitude (possibly NaN) is unusable."""
     return not largest <= LARGEST_GRADIENT
-
-
-#: Number of seen neighbors that determine the color change of an unseen Gaussian.
-NEIGHBORS = 8
-#: Number of unseen Gaussians processed at a time; their neighbors' changes and weights take some tens of megabytes.
-_CHUNK = 1 << 16
-#: Cells along each axis of the grid that orders the searches.
-_CELLS = 128
 
 
 def transferred_colors(job: StylizationJob, colors: Tensor | None = None) -> Tensor:
@@ -233,16 +201,15 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     colors, subspace = job.scene.sh_dc.clone(), job.styles.color_subspace(job.settings)
     colors[job.plan.seen] = optimized
     if transfer:
-        colors[job.plan.seen] = transferred = transferred_colors(job, optimized)
-        if job.preserves_chroma or subspace is not None:
-            chroma_of = job.scene.sh_dc[job.plan.seen] if job.preserves_chroma else None
-            bounded = constrained(transferred, chroma_of, subspace, bounded=job.settings.bounded)
-            # Frozen colors remain bit-identical.
-            colors[job.plan.seen] = torch.where(transferred != optimized, bounded, optimized)
+        transferred = transferred_colors(job, optimized)
+        chroma_of = job.scene.sh_dc[job.plan.seen] if job.preserves_chroma else None
+        bounded = constrained(transferred, chroma_of, subspace, bounded=job.settings.bounded)
+        # Frozen colors remain bit-identical.
+        colors[job.plan.seen] = torch.where(transferred != optimized, bounded, optimized)
     if job.settings.unseen != "neighbors":
         return colors
     weights = torch.where(job.plan.optimized, job.plan.survey.total_blend_weights, 0.0)
-    free = torch.ones_like(job.plan.seen) if job.regions is None else ~job.regions.frozen
+    free = torch.ones_like(job.plan.seen) if job.styles.regions is None else ~job.styles.regions.frozen
     unseen = (weights <= 0) & free
     change = neighbors_change(job.scene.means[free], (colors - job.scene.sh_dc)[free], weights[free])
     change = change.mean(dim=1, keepdim=True) if job.preserves_chroma else change
@@ -250,41 +217,6 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     chroma_of = original if job.preserves_chroma else None
     colors[unseen] = constrained(original + change, chroma_of, subspace, bounded=job.settings.bounded)
     return colors
-
-
-def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
-    """Return color changes for the Gaussians that no view sees.
-
-    Each takes the mean change of its nearest seen neighbors, weighted by their total blend weights: the change of a
-    hardly visible Gaussian is determined by only a few pixels.
-
-    Args:
-        means: [N, 3].
-        change: [N, 3], change by the optimization; rows of unseen Gaussians are ignored.
-        weights: [N] float64, total blend weights: 0 for the U unseen Gaussians, positive for at least one other.
-
-    Returns:
-        [U, 3] float32.
-    """
-    seen = weights > 0
-    if bool(seen.all()):
-        return torch.zeros((0, 3))
-    count = min(NEIGHBORS, int(seen.sum()))
-    tree = scipy.spatial.cKDTree(means[seen].double().numpy())
-    weights, change, positions = weights[seen], change[seen], means[~seen].double()
-    votes = torch.empty((len(positions), 3))
-    # Ordered by the cells of a coarse grid: consecutive searches then read the same part of the tree.
-    lowest = positions.amin(dim=0)
-    size = (positions.amax(dim=0) - lowest).clamp_min(1e-300)
-    x, y, z = ((positions - lowest) / size * (_CELLS - 1)).long().unbind(1)
-    for part in torch.argsort((x * _CELLS + y) * _CELLS + z, stable=True).split(_CHUNK):
-        _, indices = tree.query(positions[part].numpy(), k=count, workers=torch.get_num_threads())
-        nearest = torch.as_tensor(indices).reshape(-1, count)
-        own = weights[nearest]
-        fraction = own / own.amax(dim=1, keepdim=True)  # so that tiny weights do not underflow
-        sums = (change[nearest].double() * fraction[:, :, None]).sum(dim=1)
-        votes[part] = (sums / fraction.sum(dim=1, keepdim=True)).float()
-    return votes
 
 
 def render_first_view(
@@ -310,6 +242,208 @@ def render_first_view(
     colors, by_luminance = scene.sh_dc.clone(), settings.preserve_colors == "luminance"
     colors[rows] = styles.transferred(colors[rows], weights[rows], rows, preserve_chroma=by_luminance)
     return rasterizer.render(scene_colors(replace(scene, sh_dc=colors), camera), camera)
+
+
+# --- steps and their losses ----------------------------------------------------------------------------------------
+
+#: Parts of a job's time before its first step, as named in `seconds_by_part`: start of the program, inputs, refinement,
+#: survey, the rest of planning, and preparation of the steps.
+BEFORE_STEPS = ("start", "reading", "refining", "survey", "planning", "preparing")
+
+
+class ViewOrder:
+    """Random order of the views of a job, in which every view comes once before any comes again.
+
+    Attributes:
+        left: Remaining views of this round, next one last; part of checkpoints.
+    """
+
+    def __init__(self, covered: Sequence[int], seed: int) -> None:
+        self.generator = torch.Generator().manual_seed(seed)
+        self.left: list[int] = []
+        self._covered = covered
+
+    def next_view(self) -> int:
+        """Remove and return the next view. Rounds are drawn lazily, because checkpoints store the rest of a round."""
+        if not self.left:
+            drawn = torch.randperm(len(self._covered), generator=self.generator)
+            self.left = [self._covered[index] for index in drawn.tolist()]
+        return self.left.pop()
+
+
+def drawn_scales(chosen: Sequence[int], period: int, seed: int, view: int, visit: int) -> list[int]:
+    """Return the scales of a view that a visit of phase 2 evaluates, finest first (`Settings.scale_sampling`).
+
+    The coarsest is always among them. Of each `period` visits that evaluate a scale, one evaluates the next finer one
+    too. The draw depends only on the arguments: there is no random state, and all ranks agree.
+
+    Args:
+        chosen: Scales of the view with a positive weight, finest first.
+        period: Number of visits; 1 for all scales in every visit.
+        visit: Number of earlier visits of the view.
+    """
+    count = 1
+    while count < len(chosen):
+        visit, position = divmod(visit, period)
+        digest = hashlib.blake2b(f"{seed},{view},{count},{visit}".encode(), digest_size=8).digest()
+        if position != int.from_bytes(digest, "big") % period:
+            break
+        count += 1
+    return list(chosen[-count:])
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """Record of one iteration.
+
+    Attributes:
+        step: Step number, counted from 1 over both phases.
+        view: Index of the camera; of the first one if the step has several views.
+        seconds: Wall-clock seconds of all iterations so far, in all sessions of a resumed job.
+        loss: Loss before the step, mean over the step's views and over the scales in `terms`.
+        terms: Loss by scale and term; of scales that the step has not evaluated, an estimate (`completed`).
+        parts: Time in seconds of this step by activity.
+        memory: Physical memory of the process after the step, in bytes.
+        device_memory: Peak GPU memory of tensors so far, in bytes; None on a CPU.
+        evaluated: Scales that the step has evaluated.
+        pixels: Pixels that this rank has passed through the network.
+    """
+
+    step: int
+    stage: str
+    view: int
+    seconds: float
+    loss: float
+    terms: dict[int, LossTerms]
+    parts: dict[str, float]
+    memory: int
+    device_memory: int | None = None
+    evaluated: tuple[int, ...] = ()
+    pixels: int = 0
+
+
+@dataclass
+class StylizerState:
+    """State from which a run resumes with bit-identical results."""
+
+    sh_dc: Tensor  # [N, 3]
+    first_moment: Tensor  # [N, 3]
+    second_moment: Tensor  # [N, 3]
+    step: int
+    seconds: float
+    generator: Tensor  # state of the random generator
+    queue: list[int]  # views left in this round
+    history: list[StepRecord] = field(default_factory=list)
+    seconds_by_part: dict[str, float] = field(default_factory=dict)
+    # memory budget in bytes: it determines partition and cached weights, and thereby rounding
+    memory: int | None = None
+
+
+Evaluation = dict[int, LossTerms]
+#: Callback that receives the number of completed and of all views.
+ShowViews = Callable[[int, int], None]
+
+
+def show_nothing(done: int, total: int) -> None:
+    """Ignore the progress."""
+
+
+def evaluate(
+    targets: ViewTargets,
+    style_targets: Callable[[Camera], StyleTargets],
+    indices: Sequence[int],
+    sh_dc: Tensor,
+    show: ShowViews = show_nothing,
+) -> Evaluation:
+    """Return the mean SOS loss of colors [n, 3] over views, split by scale; `show` is called before each view."""
+    views, loss = targets.views, targets.loss
+    evaluations = []
+    for done, index in enumerate(indices):
+        show(done, len(indices))
+        camera = views.cameras[index]
+        with torch.no_grad():
+            image = views.render(index, views.colors(index, sh_dc))
+        target = targets.target(index, loss.tiling.scales((camera.height, camera.width)))
+        evaluations.append(loss.evaluate(image, style_targets(camera), target, gradient=False).terms)
+    return mean_evaluation(evaluations)
+
+
+def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
+    """Return the mean over views, scale by scale; views without a scale do not count for it."""
+    result: Evaluation = {}
+    for scale in dict.fromkeys(scale for evaluation in evaluations for scale in evaluation):
+        parts = [evaluation[scale] for evaluation in evaluations if scale in evaluation]
+        result[scale] = sum(parts, LossTerms()) / len(parts)
+    return result
+
+
+def completed(evaluation: Evaluation, scales: Sequence[int], view: int, history: Sequence[StepRecord]) -> Evaluation:
+    """Return the loss of a step on a view, with estimates for the scales that it has not evaluated.
+
+    An estimate is the loss of the coarsest scale times the ratio of both at the latest step that evaluated both: on the
+    same view, or on any if there is none. Before the first of these steps, a scale is missing. Means over rounds are
+    thereby comparable from round to round, whichever scales were drawn.
+
+    Args:
+        evaluation: Loss of the evaluated scales.
+        scales: Scales of the view with a positive weight.
+        history: Records of the earlier steps.
+    """
+    result, coarsest = dict(evaluation), max(evaluation)
+    for scale in set(scales) - evaluation.keys():
+        last = _last_with({scale, coarsest}, history, view) or _last_with({scale, coarsest}, history)
+        if last:
+            factor = ratio(evaluation[coarsest].total, last[coarsest].total) or 0.0
+            result[scale] = last[scale] * factor
+    return dict(sorted(result.items()))
+
+
+def _last_with(scales: set[int], history: Sequence[StepRecord], view: int | None = None) -> Evaluation | None:
+    """Return the loss of the last step that evaluated some scales, on one view or on any."""
+    steps = (record for record in reversed(history) if view in (None, record.view))
+    return next((record.terms for record in steps if scales <= set(record.evaluated)), None)
+
+
+def round_loss(history: Sequence[StepRecord], round_length: int) -> float:
+    """Return the loss of the last round of views: the geometric mean over the last steps of the current phase.
+
+    Single steps see single views, whose losses differ by factors.
+    """
+    return smoothed([record.loss for record in _last_round(history, round_length)], round_length)
+
+
+def round_evaluation(history: Sequence[StepRecord], round_length: int, weights: ScaleWeights = EVEN) -> Evaluation:
+    """Return the loss of the last round of views by scale and term, scaled so that its mean is `round_loss`."""
+    evaluation = mean_evaluation([record.terms for record in _last_round(history, round_length)])
+    mean = mean_loss(evaluation, weights)
+    factor = round_loss(history, round_length) / mean if mean > 0 else 1.0
+    return {scale: terms * factor for scale, terms in evaluation.items()}
+
+
+def _last_round(history: Sequence[StepRecord], round_length: int) -> list[StepRecord]:
+    last = history[-round_length:]
+    return [record for record in last if record.stage == last[-1].stage]
+
+
+def relative_loss(before: Evaluation, after: Evaluation, weights: ScaleWeights = EVEN) -> float | None:
+    """Return the loss after a job relative to that before it, over the scales that were computed.
+
+    It is None if the loss before the job is 0.
+    """
+    return ratio(mean_loss(after, weights), mean_loss(on_scales_of(after, before), weights))
+
+
+def on_scales_of(after: Evaluation, before: Evaluation) -> Evaluation:
+    """Return the part of `before` on the scales of `after`, or all of `before` if they have none in common."""
+    return {scale: before[scale] for scale in after if scale in before} or before
+
+
+def mean_loss(evaluation: Evaluation, weights: ScaleWeights = EVEN) -> float:
+    """Return E_SOS, the weighted mean of the losses of all scales."""
+    return weights.mean({scale: terms.total for scale, terms in evaluation.items()})
+
+
+# --- stylizer ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -359,14 +493,13 @@ class Stylizer:
         self.seconds_by_part: dict[str, float] = {}
         self.history: list[StepRecord] = []
         self.measured: dict[str, Any] = {"novel_views": None, "approximations": None}
-        self.latest: list[int] = []
         settings, views, seen = job.settings, job.views, job.plan.seen
         device = views.rasterizer.device
         # Computed once, because another processor may round differently and ranks must start with the same bits.
         warm = job.plan.warm_start
         start = job.collectives.broadcast(lambda: transferred_colors(job)) if warm else views.scene.sh_dc
         self.sh_dc = start.clone().to(device)
-        frozen = job.regions.frozen[seen] if job.regions else torch.zeros(0, dtype=torch.bool)
+        frozen = job.styles.regions.frozen[seen] if job.styles.regions else torch.zeros(0, dtype=torch.bool)
         #: Mask [n, 1] of frozen Gaussians; None if there are none.
         self._frozen = frozen.to(device)[:, None] if frozen.any() else None
         subspace = job.collectives.broadcast(lambda: job.styles.color_subspace(settings))
@@ -434,25 +567,28 @@ class Stylizer:
     @property
     def phase(self) -> Phase:
         """Phase of the next step; the last phase if all steps are done."""
-        return phase_at(self.job.schedule, self.step)
+        coarse, sos = self.job.schedule
+        return coarse if self.step < coarse.steps else sos
 
     def start(self, show: ShowViews = show_nothing) -> Evaluation:
         """Return the loss of the unstylized scene on the evaluation views; evaluated once, at the first call."""
         if self._start is None:
-            with self.measuring():
+            with self.timed("measuring"):
                 self._start = self.evaluate(self.job.evaluation_views, self.job.views.scene.sh_dc, show)
         return self._start
 
     @contextmanager
-    def measuring(self) -> Iterator[None]:
-        """Record the time of a `with` block as measuring, separately from the steps."""
+    def timed(self, part: str) -> Iterator[None]:
+        """Record the time of a `with` block as a part of the job's, separately from the steps."""
         started, parts = time.perf_counter(), self.seconds_by_part
         yield
-        parts["measuring"] = parts.get("measuring", 0.0) + time.perf_counter() - started
+        parts[part] = parts.get(part, 0.0) + time.perf_counter() - started
 
     def drawn_background(self, index: int) -> Color | None:
         """Return the background color of a view in the next step; None for the background of the settings."""
-        return drawn_color(self.job.plan.training_background, self.job.settings.seed, self.step, index, self.job.style)
+        return drawn_color(
+            self.job.plan.training_background, self.job.settings.seed, self.step, index, self.job.styles.own
+        )
 
     @property
     def reads_late(self) -> bool:
@@ -481,10 +617,10 @@ class Stylizer:
         """
         started = time.perf_counter()
         self._stylized = None
-        self.job.timer.clear()
+        self.job.loss.timer.clear()
         self._cache_visited()
         phase = self.phase
-        self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
+        views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
         before = self._queued
         self._queue(views, phase)
         if self.job.plan.precision == "float16" and self._queued is not None and is_too_large(self._queued.largest()):
@@ -530,18 +666,18 @@ class Stylizer:
     def _queue(self, views: list[int], phase: Phase) -> None:
         """Queue a step."""
         gradient, results, pixels = with_second_attempt(self.job, lambda: self._mean_gradient(views, phase))
-        with self.job.timer("optimizer"):
+        with self.job.loss.timer("optimizer"):
             done = self.step / max(self.job.total_steps - 1, 1)
             # In float32, so that the rate does not depend on the number of steps by rounding (`Settings.with_steps`).
             rate = self.job.settings.learning_rate
             if self.job.settings.learning_rate_end != rate:
                 rate = float(np.float32(self.job.settings.learning_rate_at(done)))
             largest = self._optimizer.update(gradient, rate)
-        with self.job.timer("communication"):
+        with self.job.loss.timer("communication"):
             self.job.team.check_drift(self.step + 1, self.sh_dc)
         values, copied = self._copied(largest, results)
         results = [replace(result, image_gradient=None) for result in results]  # frees the gradients
-        timer = self.job.timer.lap()
+        timer = self.job.loss.timer.lap()
         self._queued = _QueuedStep(self.step + 1, phase, views, results, pixels, values, copied, timer)
 
     def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, list[SosResult], int]:
@@ -556,20 +692,20 @@ class Stylizer:
         for index in own_views:
             scales = self._scales(index, phase, self.step, views[0])
             background = self.drawn_background(index)
-            with self.job.timer("prepare", whole=True):
+            with self.job.loss.timer("prepare", whole=True):
                 self.job.views.cache_weights(index)
                 target = self.job.view_targets.target(index, list(scales), background)
                 style = self.job.style_targets(self.job.views.cameras[index])
             assert target.division is not None
-            cost += target.division.cost(self.job.group.rank, self.job.network.halo)
+            cost += target.division.cost(self.job.team.group.rank, self.job.network.halo)
             own, result = self.job.gradient(index, self.sh_dc.detach(), style, target, scales, background)
             gradient = own if gradient is None else gradient.add_(own)
             results.append(result)
         assert gradient is not None
         if len(views) > 1:
             if self.job.team.groups > 1:  # all ranks of a group have the same gradient: count it once
-                with self.job.timer("communication"):
-                    gradient = self.job.collectives.all_reduce(gradient / self.job.group.size)
+                with self.job.loss.timer("communication"):
+                    gradient = self.job.collectives.all_reduce(gradient / self.job.team.group.size)
             gradient = gradient / len(views)
         if self._frozen is not None:
             gradient = gradient.masked_fill(self._frozen, 0)  # Adam does not change colors with zero gradient
@@ -610,7 +746,7 @@ class Stylizer:
         ]
         if self.job.team.groups > 1:
             with queued.timer("communication"):
-                every = self.job.collectives.all_gather(evaluations)[:: self.job.group.size]
+                every = self.job.collectives.all_gather(evaluations)[:: self.job.team.group.size]
             evaluations = [terms for part in every for terms in part]
         return mean_evaluation(evaluations)
 
@@ -622,12 +758,11 @@ class Stylizer:
             first: First view of the step, whose draw applies to all of them, so that no group of ranks waits.
         """
         chosen, settings = phase.scales(self.job.scales(index)), self.job.settings
-        period = settings.scale_sampling
-        if period == 1 or len(chosen) == 1:
+        if settings.scale_sampling == 1 or len(chosen) == 1:
             return chosen
         visit = step * settings.views_per_step // len(self.job.views.covered)
-        drawn = drawn_scales(chosen, period, settings.seed, first, visit)
-        return self.job.loss.weights.sampled(chosen, drawn, period)
+        drawn = drawn_scales(chosen, settings.scale_sampling, settings.seed, first, visit)
+        return self.job.loss.weights.sampled(chosen, drawn, settings.scale_sampling)
 
     def evaluate(
         self, indices: Sequence[int], sh_dc: Tensor | None = None, show: ShowViews = show_nothing
@@ -644,18 +779,22 @@ class Stylizer:
         job = self.job
         return with_second_attempt(job, lambda: evaluate(job.view_targets, job.style_targets, indices, values, show))
 
-    def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
+    def gradient(self, index: int, scales: Sequence[int], sh_dc: Tensor | None = None) -> tuple[Tensor, float]:
         """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its time in seconds.
 
         Targets are prepared before timing starts. This does not affect steps, and caches no blend weights.
+
+        Args:
+            sh_dc: [n, 3], colors of the rendered Gaussians; None for the present ones.
         """
         self._cache_visited()
+        values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
         target, style = (
             self.job.view_targets.target(index, scales),
             self.job.style_targets(self.job.views.cameras[index]),
         )
         started = time.perf_counter()
-        gradient = self.job.gradient(index, self.sh_dc.detach(), style, target, scales)[0].cpu()
+        gradient = self.job.gradient(index, values, style, target, scales)[0].cpu()
         return gradient, time.perf_counter() - started
 
     def _cache_visited(self) -> None:
@@ -667,7 +806,7 @@ class Stylizer:
         if not steps:
             return
         order = ViewOrder(self.job.views.covered, self.job.settings.seed)
-        with self.job.timer("prepare"):
+        with self.job.loss.timer("prepare"):
             for _ in range(steps):
                 views = [order.next_view() for _ in range(self.job.settings.views_per_step)]
                 for index in views[self.job.team.own_group :: self.job.team.groups]:
@@ -695,24 +834,6 @@ class Stylizer:
         if not self.job.transfers_last:
             return self.sh_dc.detach()
         return self.stylized()[self.job.plan.seen].to(self.sh_dc.device)
-
-    def set_colors(self, sh_dc: Tensor) -> None:
-        """Replace the present colors with sh_dc [N, 3] of the whole scene, for example to evaluate them."""
-        self._stylized = None
-        with torch.no_grad():
-            self.sh_dc.copy_(sh_dc[self.job.plan.seen])
-
-    @contextmanager
-    def with_colors(self, sh_dc: Tensor) -> Iterator[None]:
-        """Use sh_dc [N, 3] of the whole scene inside a `with` block, then restore the present colors exactly."""
-        present, stylized = self.sh_dc.detach().clone(), self._stylized
-        self.set_colors(sh_dc)
-        try:
-            yield
-        finally:
-            self._stylized = stylized
-            with torch.no_grad():
-                self.sh_dc.copy_(present)
 
     def state(self) -> StylizerState:
         """Return a copy of everything that a resumed run needs."""

@@ -6,14 +6,13 @@ import functools
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from sgsst_core.budget import Cache, content_fraction
 from sgsst_core.devices import Timer
-from sgsst_core.features.partition import PartitionTile, Rectangle
+from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import ContentFeatures, ViewTarget
@@ -26,7 +25,6 @@ from sgsst_core.parallel import (
     Piece,
     ScaledView,
     Shares,
-    ShownGaussians,
     ViewImages,
 )
 from sgsst_core.rasterizer import Rasterizer
@@ -100,18 +98,8 @@ class Views:
         self._divider = divider
         self._regions = regions
         self._shares: dict[int, Shares] = {}
-        shown = memory // 16 if self.collectives.size > 1 else 0
-        self._shown: Cache[int, ShownGaussians] = Cache(shown)
-        self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4 - shown)
+        self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4)
         self._sh_dc = scene.sh_dc.to(rasterizer.device)
-
-    @property
-    def caches(self) -> dict[str, Cache[Any, Any]]:
-        """Caches of data of the views by name, "weights" before "intersections"."""
-        return {"colors": self.colors.cache, "shown": self._shown, **self.rasterizer.caches}
-
-    def __len__(self) -> int:
-        return len(self.cameras)
 
     def render(self, index: int, colors: Tensor, rasterizer: Rasterizer | None = None) -> Tensor:
         """Return the image of a view; with several ranks, of the rectangle [h, w, 3] that this rank renders.
@@ -165,7 +153,6 @@ class Views:
     def forget_shares(self) -> None:
         """Clear what depends on the rectangles that the ranks render, because they are about to change."""
         self._shares.clear()
-        self._shown.clear()
         self.rasterizer.forget_views()
 
     def gradient(self, index: int, image_gradient: Tensor, colors: Tensor) -> Tensor:
@@ -180,7 +167,8 @@ class Views:
             gradient = self._nothing(len(colors), 3)
         else:
             gradient = self.rasterizer.color_gradient(image_gradient, camera)
-        gradient = self._sum(gradient, self._shown_by(index))
+        with self.timer("communication"):
+            gradient = self.collectives.all_reduce(gradient)
         # After the sum, because which colors pass the clamp depends on the sign of their total gradient.
         return view_colors_gradient(gradient, colors, clamp_aware_gradient=self.clamp_aware_gradient)
 
@@ -192,39 +180,6 @@ class Views:
         camera = self._own_camera(index)
         if camera is not None:
             self.rasterizer.cache_weights(camera)
-
-    def _sum(self, gradient: Tensor, shown: ShownGaussians | None) -> Tensor:
-        """Return the sum [N, 3] of all ranks' gradients, which are 0 for all Gaussians but those in `shown`."""
-        with self.timer("communication"):
-            if shown is None or not shown.sparse:
-                return self.collectives.all_reduce(gradient)
-            indices = shown.indices()
-            return gradient.index_copy_(0, indices, self.collectives.all_reduce(gradient.index_select(0, indices)))
-
-    def _shown_by(self, index: int) -> ShownGaussians | None:
-        """Return the Gaussians that any rank's rectangle of a view shows.
-
-        Ranks agree on them at the first visit, using the same blend weights as gradients do. Blend weights of another
-        rasterizer, or of the whole view instead of its rectangles, may differ by rounding at the smallest opacity.
-
-        Returns:
-            The Gaussians; None if there is only one rank, or if they do not fit in the cache.
-        """
-        size = ShownGaussians.nbytes(len(self.scene))
-        if self.collectives.size == 1 or (index not in self._shown and not self._shown.has_space(size)):
-            return None
-
-        def find() -> ShownGaussians:
-            mask = torch.zeros(len(self.scene), dtype=torch.bool, device=self.rasterizer.device)
-            with self.timer("prepare"):
-                camera = self._own_camera(index)
-                if camera is not None:  # weights are never negative, so their sum is 0 only if all are
-                    ones = torch.ones((camera.height, camera.width, 3))
-                    mask = self.rasterizer.color_gradient(ones, camera)[:, 0] > 0
-            with self.timer("communication"):
-                return ShownGaussians(self.collectives.all_reduce(mask.int()) > 0)
-
-        return self._shown.get(index, find, size)
 
     def _nothing(self, *shape: int) -> Tensor:
         """Return zeros: the contribution of a rank that has no pixels of a view."""
@@ -350,16 +305,6 @@ class ViewTargets:
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
         self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
 
-    @property
-    def caches(self) -> dict[str, Cache[Any, Any]]:
-        """Caches of data of the views by name."""
-        return {
-            "coverage": self._coverage,
-            "maps": self._region_weights,
-            "images": self._images,
-            "content": self._content,
-        }
-
     def target(self, index: int, scales: Sequence[int], background: Color | None = None) -> ViewTarget:
         """Return the target of a view at some scales; cached if it fits.
 
@@ -378,37 +323,39 @@ class ViewTargets:
             content_weights=self.content_weights(index),
             background=background or self._background,
         )
-        images = functools.cache(lambda: self._content_images(index, division))
-        if self.loss.content_weight and background is not None:
-            for scale in scales:
-                content = self._images.get(
-                    (index, scale, division.pieces[scale]), functools.partial(_scaled, images, scale)
-                )
-                over = self._content_over(index, content, background)
-                target.content[scale] = self.loss.targets.content_features(over, division.tiles[scale])
-        elif self.loss.content_weight:
-            for scale in scales:
-                pieces = division.pieces[scale]
-                make = functools.partial(self._features, images, scale, division.tiles[scale])
-                size = self.loss.targets.content_bytes(pieces)
-                target.content[scale] = self._content.get((index, scale, pieces), make, size)
+        # Every rank has the whole of a photo.
+        whole = division if self.photos is None else replace(division, shares=None)
+        images = functools.cache(
+            lambda: ViewImages(self.content(index), whole, self._background, self.loss.collectives, self.loss.timer)
+        )
+
+        def features(scale: int) -> ContentFeatures:
+            make, tiles = self.loss.targets.content_features, division.tiles[scale]
+            key = index, scale, division.pieces[scale]
+            if background is None:
+                size = self.loss.targets.content_bytes(division.pieces[scale])
+                return self._content.get(key, lambda: make(images().scaled(scale), tiles), size)
+            content = self._images.get(key, lambda: images().scaled(scale))
+            return make(self._content_over(index, content, background), tiles)
+
+        if self.loss.content_weight:
+            target.content.update({scale: features(scale) for scale in scales})
         return target
 
     def content(self, index: int) -> Tensor:
-        """Return the content image: the photo [H, W, 3], or `Views.unstylized`.
-
-        Photos are on the GPU if there is one.
-        """
-        if self.photos is not None:
-            return self.photos(index).to(self.loss.network.device)
-        return self.views.unstylized(index)
+        """Return the content image on the network's device: the photo [H, W, 3], or `Views.unstylized`."""
+        image = self.views.unstylized(index) if self.photos is None else self.photos(index)
+        return image.to(self.loss.network.device)
 
     def coverage(self, index: int) -> list[Tensor]:
         """Return the coverage [H >> k, W >> k] of a view at powers of two, on the network's device.
 
         It is cached if it fits.
         """
-        return self._coverage.get(index, lambda: self._rendered_coverage(index))
+        views, render = self.views, self.views.rasterizer.uncached.coverage
+        return self._coverage.get(
+            index, lambda: self.loss.targets.position_weights(views.whole(index, views.window(index, render)))
+        )
 
     def region_weights(self, index: int) -> list[list[Tensor]] | None:
         """Return the map of each region in a view, in the format of `coverage`; None if the scene has no regions."""
@@ -441,13 +388,6 @@ class ViewTargets:
         self._divisions.clear()
         self.views.forget_shares()
 
-    def _content_images(self, index: int, division: Division) -> ViewImages:
-        """Return the content image of a view at the scales of a division."""
-        image = self.content(index).to(self.loss.network.device)
-        if self.photos is not None:  # every rank has the whole photo
-            division = replace(division, shares=None)
-        return ViewImages(image, division, self._background, self.loss.collectives, self.loss.timer)
-
     def _content_over(self, index: int, content: ScaledView, color: Color) -> ScaledView:
         """Return the content of a view at a scale with another background color.
 
@@ -474,32 +414,18 @@ class ViewTargets:
             known = self._regions[index] if self._regions else None
             if self.views.shares(index) is not None:
                 self._divisions[key] = divider.divide_view((camera.height, camera.width), scales, coverage, known)
-            elif self.loss.network.device.type != "cpu":
-                self._divisions[key] = divider.divide(sizes, coverage, known)
             else:
-                self._divisions[key] = divider.divide(sizes, coverage)
+                on_gpu = self.loss.network.device.type != "cpu"
+                self._divisions[key] = divider.divide(sizes, coverage, known if on_gpu else None)
         return self._divisions[key]
-
-    def _rendered_coverage(self, index: int) -> list[Tensor]:
-        window = self.views.window(index, self.views.rasterizer.uncached.coverage)
-        return self.loss.targets.position_weights(self.views.whole(index, window))
 
     def _rendered_maps(self, index: int, render: Callable[[Camera], Tensor], count: int) -> list[list[Tensor]]:
         whole = self.views.whole(index, self.views.window(index, render, count))
         return [self.loss.targets.position_weights(weights) for weights in whole.unbind(2)]
 
-    def _features(
-        self, images: Callable[[], ViewImages], scale: int, tiles: Sequence[PartitionTile]
-    ) -> ContentFeatures:
-        return self.loss.targets.content_features(images().scaled(scale), tiles)
-
 
 #: Index of the view, scale, and every rank's pieces of it.
 _ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
-
-
-def _scaled(images: Callable[[], ViewImages], scale: int) -> ScaledView:
-    return images().scaled(scale)
 
 
 def _image_bytes(view: ScaledView) -> int:

@@ -146,7 +146,7 @@ def pretend_cuda() -> Iterator[Counts]:
     with (
         mock.patch.multiple(torch.cuda, **instead),
         # A convolution that fills a GPU takes a processor seconds, and the times of this device mean nothing.
-        mock.patch.dict("sgsst_core.stylizing.planner._SIDES", cuda=(16, 16)),
+        mock.patch.dict("sgsst_core.stylizing.job._SIDES", cuda=(16, 16)),
         mock.patch.object(torch.distributed, "is_nccl_available", return_value=False),
         mock.patch.object(GridExecutor, "__call__", _count_launch(GridExecutor.__call__)),
         device.modes(),

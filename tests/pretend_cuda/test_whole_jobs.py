@@ -89,7 +89,7 @@ def test_job_runs_resumes_and_reports(
     first = prepare(asked)
     plan = first.stylizer.job.plan
     assert (plan.device, plan.uncached, plan.weighted) == ("cuda", "triton", scan)
-    used, spare = first.stylizer.job.views.caches["intersections"].capacity, plan.spare // 2
+    used, spare = first.stylizer.job.views.rasterizer.caches["intersections"].capacity, plan.spare // 2
     assert plan.cached_weights != "none" or used == memory_for("rasterizer", plan.memory_limit) + spare > spare > 0
     assert (first.stylizer.job.styles.color_subspace(first.stylizer.job.settings) is not None) == gray
     assert run_job(first, steps=1).stopped == "interrupted"

@@ -7,9 +7,9 @@ import numba
 import pytest
 from rich.console import Console
 
-from sgsst_core.progress import Progress, clock, duration
-from sgsst_core.stylizing import progress_bar
-from sgsst_core.stylizing.progress_bar import job_bar
+from sgsst_core import progress as module
+from sgsst_core.compiled import compilations_reported
+from sgsst_core.progress import Progress, clock, duration, job_bar
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_terminal_shows_views_then_steps() -> None:
 def test_terminal_shows_compilation_of_kernels() -> None:
     add: Any = numba.njit(lambda a, b: a + b)  # type: ignore[call-arg]
     console = Console(file=io.StringIO(), force_terminal=True, width=120, color_system=None)
-    with job_bar(console) as bar:
+    with job_bar(console) as bar, compilations_reported(bar.show_compiling):
         for _ in range(2):
             bar.show(Progress(stage="planning", step=0, total=8))
             add(1, 2)
@@ -89,7 +89,7 @@ def test_terminal_shows_compilation_of_kernels() -> None:
 
 def test_log_prints_a_line_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shown(terminal=False).strip() == ""
-    monkeypatch.setattr(progress_bar, "LOG_SECONDS", 0.0)
+    monkeypatch.setattr(module, "LOG_SECONDS", 0.0)
     assert shown(terminal=False).strip().splitlines() == [
         "Surveying the views: view 0 of 8",
         "Surveying the views: view 3 of 8, 2:05 left",

@@ -41,8 +41,9 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import MAX_RESOLUTION, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkpoint, save_checkpoint, versions
-from sgsst_core.stylizing.job import JobInputs, check_style_size, prepare_job, prepared_style, rotated
+from sgsst_core.stylizing.job import JobInputs, prepare_job
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.styles import check_style_size, prepared_style, rotated
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
@@ -257,8 +258,7 @@ def test_float32_reference_has_the_same_content_weights(tiny_weights: BackboneWe
     stylizer = make(tiny_weights, wall(), protected(), warm_start=False)
     scales = stylizer.job.scales(0)
     colors = torch.roll(wall().sh_dc, 1, dims=0)
-    with stylizer.with_colors(colors):
-        own = stylizer.gradient(0, scales)[0]
+    own = stylizer.gradient(0, scales, colors[stylizer.job.plan.seen])[0]
     exact = Float32Reference(stylizer).gradient(0, colors, scales)[0][stylizer.job.plan.seen]
     assert relative_error(own, exact) < 1e-6
     other = Float32Reference(make(tiny_weights, wall(), None, warm_start=False)).gradient(0, colors, scales)[0]
@@ -579,7 +579,7 @@ def test_job_uses_the_prepared_style(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("standard", style_rotation=90, preserve_colors="match", style_scale=2, coarsest_side=24)
     scene, style = wall(), noise()
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
-    (used,) = stylizer.job.style.images
+    (used,) = stylizer.job.styles.own.images
     assert used.shape == (60, 40, 3)
     assert stylizer.job.loss.style_scale == 2
     weights = stylizer.job.plan.survey.total_blend_weights

@@ -159,4 +159,4 @@ def test_styles_of_jobs_and_regions_are_checked(tiny_weights):
         Stylizer.planned(scene, cameras(1), given, settings, weights=tiny_weights, regions=where).job
         for given, where in ((BYTES.numpy(), None), (FLOATS, None), (FLOATS, regions))
     ]
-    assert all(torch.equal(job.style.images[0], FLOATS) for job in jobs)
+    assert all(torch.equal(job.styles.own.images[0], FLOATS) for job in jobs)

@@ -50,10 +50,10 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.get_by_role("button", name="Estimate time").click()
     cost = page.get_by_role("region", name="Estimate")
     cost.get_by_text("616", exact=True).wait_for()
-    assert cost.get_by_text("network layers").is_hidden(), "what a plan decides is folded away"
+    assert cost.get_by_text("partition").is_hidden(), "what a plan decides is folded away"
     assert cost.get_by_text("automatic").count() == 0
     cost.get_by_text("How it will run").click()
-    cost.get_by_text("network layers").wait_for()
+    cost.get_by_text("partition").wait_for()
 
     page.locator("canvas.view").evaluate("(canvas) => { canvas.id = 'same'; }")
     page.on("request", lambda request: sent.append(request.url))

@@ -24,7 +24,7 @@ def test_this_machine_works(tiny_installed: Path) -> None:
     findings = list(examine(limit=400.0))
     assert [finding for finding in findings if finding.state == "problem"] == []
     topics = [finding.topic for finding in findings]
-    assert topics == ["weights", "cache", "program", "GPU", "memory", "rasterizer", "precision", "results", "kernels"]
+    assert topics == ["weights", "program", "GPU", "memory", "rasterizer", "precision", "results", "kernels"]
     assert "checks pass" in findings[-2].text
 
 

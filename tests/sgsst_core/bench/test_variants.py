@@ -35,7 +35,7 @@ def test_pareto_front_contains_undominated_points() -> None:
         return Curve(VARIANTS[name], [Point(seconds, 1, loss, {0: loss}) for seconds, loss in points])
 
     curves = [curve("standard", (1, 0.9), (2, 0.5), (4, 0.3)), curve("two-views", (1, 0.8), (2, 0.6), (3, 0.4))]
-    front = [(name, point.seconds) for name, point in pareto_front(curves)]
+    front = [(name, point.seconds) for name, point, _ in pareto_front(curves)]
     assert front == [("two-views", 1), ("standard", 2), ("two-views", 3), ("standard", 4)]
 
 

@@ -24,8 +24,7 @@ from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs
-from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.job import JobInputs, plan_job
 from tests.real_scenes import scene_path
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
@@ -82,7 +81,7 @@ def verdict(scene: Scene, views: list[Camera]) -> str:
 )
 def test_cameras_of_no_real_capture_are_reported(change: Callable[[Camera], Camera], reported: list[str]) -> None:
     views = cameras()
-    lines = implausible(wall().means, [change(views[0]), *views[1:]])
+    lines = list(implausible(wall().means, [change(views[0]), *views[1:]]))
     assert len(lines) == len(reported)
     for line, text in zip(lines, reported, strict=True):
         assert text in line.decision

@@ -32,7 +32,7 @@ from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobStyles
+from sgsst_core.stylizing.styles import JobStyles
 from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import ball, blind_camera, cameras, style, wall

@@ -9,15 +9,13 @@ import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel import ALONE
-from sgsst_core.planning.facts import equip
+from sgsst_core.planning.plan import equip
 from sgsst_core.quality.measure import Difference, Float32Reference, Measurements, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs, prepare_job
+from sgsst_core.stylizing.job import JobInputs, plan_job, prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
-from sgsst_core.stylizing.planner import plan_job
-from sgsst_core.stylizing.steps import mean_loss
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Stylizer, mean_loss
 from tests.rounding import RoundedToTf32
 from tests.small_scenes import ball, cameras, style, wall
 

@@ -277,8 +277,7 @@ def test_job_uses_the_requested_rasterizer(tiny_weights: BackboneWeights) -> Non
     from sgsst_core.quality.measure import approximations
     from sgsst_core.settings import make_settings
     from sgsst_core.style import Style
-    from sgsst_core.stylizing.job import JobInputs, prepare_job
-    from sgsst_core.stylizing.planner import plan_job
+    from sgsst_core.stylizing.job import JobInputs, plan_job, prepare_job
     from sgsst_core.stylizing.stylizer import Stylizer
     from tests.small_scenes import ball, cameras, style
 

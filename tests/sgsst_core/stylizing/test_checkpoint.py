@@ -22,7 +22,7 @@ from sgsst_core.stylizing.checkpoint import (
     save_checkpoint,
     versions,
 )
-from sgsst_core.stylizing.steps import StepRecord, StylizerState
+from sgsst_core.stylizing.stylizer import StepRecord, StylizerState
 from tests.small_scenes import cameras, style, wall
 
 
@@ -98,7 +98,7 @@ def test_checkpoint_round_trips_exactly(full_checkpoint: Checkpoint, tmp_path: P
 
 def test_checkpoint_of_an_earlier_version_is_refused(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "c", full_checkpoint, "job")
-    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"10"', b'"version":"09"'))
+    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"11"', b'"version":"10"'))
     with pytest.raises(CheckpointError, match="another version of this program"):
         load_checkpoint(tmp_path / "c", "job")
 

@@ -16,9 +16,8 @@ from sgsst_core.scene.colors import LARGEST, gray, luminance, resize_area, style
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.color_transfer import luminance_start
-from sgsst_core.stylizing.job import prepared_style
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.styles import luminance_start, prepared_style
 from sgsst_core.stylizing.stylizer import ADAM_EPS, LARGEST_GRADIENT, ColorOptimizer, Stylizer
 from tests.sgsst_core.rasterizer.splat_reference import ReferenceRasterizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
@@ -233,7 +232,7 @@ def test_gradient_is_the_derivative_by_luminance(tiny_weights: BackboneWeights) 
     colors = (COLOR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)
     image = rasterizer.render(colors, view)
     size = (view.height, view.width)
-    (painting,) = stylizer.job.style.images
+    (painting,) = stylizer.job.styles.own.images
     used = resize_area(painting, style_size((painting.shape[0], painting.shape[1]), size))
     _, pixels = sos_reference(stylizer.job.weights, image, used, image, coarsest=24)
     exact = rasterizer.color_gradient(pixels, view) * SH_C0 * (colors > 0)

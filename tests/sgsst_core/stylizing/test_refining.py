@@ -27,7 +27,6 @@ from sgsst_core.refine import (
     choose_pieces,
     finest_size,
     max_children,
-    mixture_error,
     parents_of,
     piece_counts,
     ratio_of,
@@ -181,7 +180,7 @@ def test_refinement_reports_its_progress(tiny_weights: BackboneWeights) -> None:
         JobInputs(large_wall(), cameras(), Style.of(style()), refine_settings(refine=2.0), weights=tiny_weights),
         show=lambda now: reports.append((now.stage, now.step, now.total)),
     )
-    stages = [(stage, done, 3) for stage in ("planning", "refining") for done in range(3)]
+    stages = [*(("planning", done, 3) for done in range(4)), *(("refining", done, 3) for done in range(3))]
     assert reports == [*stages, ("refining", 0, 0)]
 
 
@@ -235,8 +234,8 @@ def test_all_controls_work_together(tiny_weights: BackboneWeights) -> None:
     before = stylizer.job.scene.sh_dc.clone()
     stylized_colors = stylized(stylizer)
     assert len(stylized_colors) > len(large_wall())
-    assert stylizer.job.regions is not None
-    frozen = stylizer.job.regions.frozen
+    assert stylizer.job.styles.regions is not None
+    frozen = stylizer.job.styles.regions.frozen
     assert torch.equal(stylized_colors[frozen], before[frozen])
     assert not torch.equal(stylized_colors[~frozen], before[~frozen])
     assert bool(stylized_colors.isfinite().all())
@@ -269,22 +268,18 @@ def mixtures(children: Scene, parents: Tensor, count: int) -> tuple[Tensor, Tens
 
 @pytest.mark.parametrize("number", NUMBERS)
 def test_split_axis_has_the_parents_variance_and_nearly_its_density(number: int) -> None:
-    division = split_axis(number)
-    assert len(division.offsets) == len(division.weights) == number
-    assert division.weights.sum() == pytest.approx(1, abs=1e-14)
-    assert division.weights @ division.offsets == pytest.approx(0, abs=1e-12)
-    assert 1 / division.ratio**2 + division.weights @ division.offsets**2 == pytest.approx(1, abs=1e-11)
-    assert division.ratio == ratio_of(number)
+    (offsets, weights), ratio = split_axis(number), ratio_of(number)
+    assert len(offsets) == len(weights) == number
+    assert weights.sum() == pytest.approx(1, abs=1e-14)
+    assert weights @ offsets == pytest.approx(0, abs=1e-12)
+    assert 1 / ratio**2 + weights @ offsets**2 == pytest.approx(1, abs=1e-11)
     x = np.linspace(-9, 9, 20001)
     density = np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
-    parts = (
-        np.exp(-(((x[:, None] - division.offsets) * division.ratio) ** 2) / 2) * division.ratio / math.sqrt(2 * math.pi)
-    )
-    error = np.sqrt(((parts @ division.weights - density) ** 2).sum() / (density**2).sum())
-    assert mixture_error(division) == pytest.approx(error, abs=1e-6)
+    parts = np.exp(-(((x[:, None] - offsets) * ratio) ** 2) / 2) * ratio / math.sqrt(2 * math.pi)
+    error = np.sqrt(((parts @ weights - density) ** 2).sum() / (density**2).sum())
     assert error < 0.03
     # Factor on the opacity of a child, which never exceeds the parent's.
-    assert float((division.weights * division.ratio).max()) <= 1
+    assert float((weights * ratio).max()) <= 1
 
 
 @settings(max_examples=40, deadline=None)

@@ -224,11 +224,11 @@ def test_written_result_renders_as_optimized(tiny_weights: BackboneWeights, tmp_
     save(tmp_path / "out.ply", stylized)
     result = read_scene(tmp_path / "out.ply").scene
     stylizer = Stylizer.planned(source.scene, cameras(), style(), settings, weights=tiny_weights)
-    stylizer.set_colors(stylized.scene.sh_dc)
     again = Stylizer.planned(result, cameras(), style(), make_settings(warm_start=False), weights=tiny_weights)
+    colors = stylized.scene.sh_dc[stylizer.job.plan.seen]
     for index in range(3):
         images = [
-            each.job.views.render(index, each.job.views.colors(index, each.sh_dc.detach()))
-            for each in (stylizer, again)
+            each.job.views.render(index, each.job.views.colors(index, sh_dc))
+            for each, sh_dc in ((stylizer, colors), (again, again.sh_dc.detach()))
         ]
         assert torch.equal(*images)

@@ -23,9 +23,9 @@ from sgsst_core.scene.colors import gray
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobInputs, JobStyles, prepare_job
+from sgsst_core.stylizing.job import JobInputs, plan_job, prepare_job
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.styles import JobStyles
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views, ViewTargets
 from tests.networks import comparing_pixels, tiny_weights
@@ -226,7 +226,7 @@ def stylize_each(collectives: Collectives) -> list[dict[str, Any]]:
         exact.loss.network = FeatureNetwork(weights, job.network.layers, torch.float64)
         other = Stylizer(replace(exact, network=exact.loss.network))
         other.sh_dc = torch.nn.Parameter(torch.roll(other.sh_dc.detach(), 1, dims=0).double())
-        other.latest = views = list(range(count))
+        views = list(range(count))
         results.append(
             {
                 "losses": [record.loss for record in stylizer.history],
@@ -333,40 +333,25 @@ WIDTH, HEIGHT = 128, 96
 TILING = Tiling(halo=16, held=math.inf, working=0.0, coarsest=511)
 
 
-def make_views(collectives: Collectives, scene: Scene, camera: Camera, memory: int = 1 << 30) -> Views:
-    """Return views with this memory budget for caches; they cache nothing if it is 0."""
+def make_views(collectives: Collectives, scene: Scene, camera: Camera) -> Views:
+    """Return the only view of a scene, divided among the ranks."""
     rasterizer, divider = make_rasterizer("cpu", scene), Divider(TILING, collectives)
-    return Views(scene, [camera], rasterizer, covered=[0], memory=memory, divider=divider)
+    return Views(scene, [camera], rasterizer, covered=[0], divider=divider)
 
 
 def pixels(camera: Camera, seed: int) -> Tensor:
     return torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def both_ways(collectives: Collectives, scene: Scene, camera: Camera) -> dict[str, Any]:
-    """Return color gradients [N, 3] of two visits, with exchanges of all values and of shown Gaussians' values only."""
-    results: dict[str, Any] = {}
-    all_reduce = collectives.all_reduce
-    for name, memory in (("whole", 0), ("shown", 1 << 30)):
-        views = make_views(collectives, scene, camera, memory)
-        colors = views.colors(0, scene.sh_dc)
-        results[name], results[f"bytes {name}"] = [], (sent := list[int]())
-
-        def counted(tensor: Tensor, sent: list[int] = sent) -> Tensor:
-            sent.append(tensor.nbytes)
-            return all_reduce(tensor)
-
-        collectives.all_reduce = counted  # type: ignore[method-assign]
-        for visit in range(2):
-            make = functools.partial(pixels, seed=10 * visit + collectives.rank)
-            results[name].append(views.gradient(0, views.window(0, make, 3), colors))
-    return results
-
-
-def shown_of(scene: Scene, camera: Camera) -> Tensor:
-    """Return whether the view shows each Gaussian, [N] bool."""
-    ones = torch.ones(camera.height, camera.width, 3)
-    return make_rasterizer("cpu", scene).color_gradient(ones, camera)[:, 0] > 0
+def summed(collectives: Collectives, scene: Scene, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return the color gradient [N, 3] of a divided view, and this rank's summand [H, W, 3] of the image's gradient."""
+    views = make_views(collectives, scene, camera)
+    window, shares = views.window(0, functools.partial(pixels, seed=collectives.rank), 3), views.shares(0)
+    assert shares is not None
+    summand = torch.zeros(camera.height, camera.width, 3)
+    if window.numel():
+        summand[shares.windows[collectives.rank].slices] = window
+    return views.gradient(0, window, views.colors(0, scene.sh_dc)), summand
 
 
 def left(scene: Scene) -> Scene:
@@ -382,15 +367,11 @@ def left(scene: Scene) -> Scene:
         pytest.param(wall(), 15, id="narrow"),
     ],
 )
-def test_exchange_of_shown_gaussians_is_bit_identical_to_all(scene: Scene, height: int) -> None:
+def test_gradient_of_a_divided_view_is_that_of_the_whole(scene: Scene, height: int) -> None:
     camera = cameras(1, WIDTH, height)[0]
-    shown = int(shown_of(scene, camera).sum())
-    assert 0 < shown < 0.7 * len(scene)
-    results = on_ranks(2, both_ways, scene, camera)
-    for result in results:
-        for whole, packed, first in zip(result["whole"], result["shown"], results[0]["shown"], strict=True):
-            assert packed.any()
-            assert torch.equal(whole, packed)
-            assert torch.equal(packed, first)
-        assert result["bytes whole"] == [12 * len(scene)] * 2
-        assert result["bytes shown"] == [4 * len(scene), 12 * shown, 12 * shown]
+    (first, one), (second, other) = on_ranks(2, summed, scene, camera)
+    alone = make_views(ALONE, scene, camera)
+    expected = alone.gradient(0, one + other, alone.colors(0, scene.sh_dc))
+    assert first.any()
+    assert torch.equal(first, second)
+    assert relative_error(first, expected) < 1e-4

@@ -27,7 +27,7 @@ from sgsst_core.files.images import Photo
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.messages import decode, encode
 from sgsst_core.parallel import Collectives, ImageExchange
-from sgsst_core.planning.facts import Machine
+from sgsst_core.planning.plan import Machine
 from sgsst_core.progress import Decision
 from sgsst_core.scene.camera import Camera, Lens
 from sgsst_core.settings import make_settings

@@ -13,17 +13,14 @@ from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.color_transfer import (
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.styles import (
     _drawn,
-    _rounds,
-    _through,
-    _through_compiled,
     luminance_start,
     transported,
     warm_start,
     with_moments,
 )
-from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer, render_first_view
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.sgsst_core.test_regions import halves
@@ -157,25 +154,6 @@ def test_weighted_colors_get_the_target_distribution(scale: float) -> None:
     assert distance(sampled(actual, count), wanted) < 0.01
 
 
-@pytest.mark.parametrize("case", ["heaps", "far", "flat", "two"])
-def test_compiled_kernel_agrees_with_tensor_operations(case: str) -> None:
-    own, count, wanted = colors(3000, 13), weights(3000, 14), colors(700, 15)
-    if case == "far":  # most knots fall into one cell
-        own[::100] *= 50
-    if case == "flat":
-        own[:] = 0.3
-    if case == "two":
-        own[:] = torch.where(own[:, :1] < own[:, :1].median(), 0.2, 0.7)
-    begun = own.clamp(-10, 10)
-    indices, counts = _drawn(count)
-    rounds = _rounds(begun[indices], counts, wanted)
-    outside = torch.cat([begun, 3 * begun - 1, torch.full((1, 3), -10.0), torch.full((1, 3), 10.0)])
-    for only in rounds:  # one round at a time, because slopes of up to 1e6 amplify rounding errors
-        torch.testing.assert_close(_through_compiled(outside, [only]), _through(outside, [only]), rtol=0, atol=1e-8)
-    errors = (_through_compiled(outside, rounds) - _through(outside, rounds)).abs()
-    assert float(errors.median()) < 1e-12
-
-
 CAMERA = cameras(1)[0]
 
 
@@ -228,7 +206,7 @@ def test_transfer_changes_results_but_not_optimized_colors(tiny_weights: Backbon
     assert rows.any()
     stylized = stylizer.stylized()
     weights = stylizer.job.plan.survey.total_blend_weights[stylizer.job.plan.seen]
-    wanted = warm_start(optimized, weights, stylizer.job.style)
+    wanted = warm_start(optimized, weights, stylizer.job.styles.own)
     assert torch.equal(stylized[rows], wanted[rows[stylizer.job.plan.seen]])
     assert float((wanted - optimized).abs().mean()) > 0.01
     assert torch.equal(stylizer.sh_dc, optimized)
