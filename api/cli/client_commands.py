@@ -26,6 +26,7 @@ from api.cli.console import (
 )
 from api.cli.options import (
     JsonOption,
+    KeyOption,
     SubmittedArguments,
     cameras_of,
     file_to_write,
@@ -62,7 +63,6 @@ if TYPE_CHECKING:
 UrlOption = Annotated[
     str | None, typer.Option("--url", help="URL of the service. [default: SGSST_URL, else http://127.0.0.1:8000]")
 ]
-KeyOption = Annotated[str | None, typer.Option("--key", help="API key. [default: SGSST_KEY]")]
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="ID of a job.", show_default=False)]
 
 

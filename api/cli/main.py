@@ -37,8 +37,6 @@ _SUMMARIES: dict[str, dict[str, str]] = {
     "stylize_commands": {
         "stylize": "Stylize a scene with one or several style images.",
         "demo": "Stylize a built-in scene, lifted from a stereo photograph, in a few minutes.",
-    },
-    "batch_commands": {
         "batch": "Stylize several scenes in each of several styles; what is done already is not repeated.",
     },
     "scene_commands": {

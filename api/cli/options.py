@@ -255,6 +255,7 @@ PaintedOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+KeyOption = Annotated[str | None, typer.Option("--key", help="API key. [default: SGSST_KEY]")]
 
 
 def cameras_of(scene: str | Path, given: Any, options: ViewOptions) -> Any:
