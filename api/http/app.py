@@ -37,7 +37,6 @@ from api.http.problems import (
 )
 from api.http.receiving import Fetcher, Receipts
 from api.http.schemas import ANSWERS, path_of, subpath
-from api.http.sessions import SignIns
 from api.http.static import add_static
 from api.http.submission import JobFromUploads
 from service import problems
@@ -83,7 +82,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             inspector=inspector,
             derived=DerivedFiles(settings, store, blobs, results, threads, inspector.processes),
             hub=Hub(store),
-            sign_ins=SignIns(),
+            sign_ins=Rates(),
             rates=Rates(),
             receipts=Receipts(store.inputs, blobs, threads),
             threads=threads,

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from api.http.events import Hub
     from api.http.monitoring import Metrics, Readiness
     from api.http.receiving import Fetcher, Receipts
-    from api.http.sessions import SignIns
     from service.deadlines import FileThreads, OwnerLimit
     from service.files.blobs import Blobs
     from service.files.objects import Artifacts
@@ -68,7 +67,7 @@ class Context:
     hub: Hub
     metrics: Metrics
     readiness: Readiness
-    sign_ins: SignIns
+    sign_ins: Rates
     rates: Rates
     receipts: Receipts
     threads: FileThreads
@@ -283,19 +282,20 @@ class Rates:
         self._clock = clock
         self._left: dict[str, tuple[float, float]] = {}
 
-    def take(self, owner: str, rate: float | None) -> None:
+    def take(self, owner: str, rate: float | None, most: float | None = None) -> None:
         """Take one token from the owner's bucket.
 
         Args:
             owner: Owner of the request's key.
             rate: Requests per second that the owner may send on average; None for no limit.
+            most: Capacity of the bucket; None for the requests of ten seconds.
 
         Raises:
             RATE_LIMITED: If the owner's bucket is empty.
         """
         if rate is None:
             return
-        most = max(1.0, rate * _BURST_SECONDS)
+        most = most or max(1.0, rate * _BURST_SECONDS)
         now = self._clock()
         left, seen = self._left.pop(owner, (most, now))
         left = min(most, left + (now - seen) * rate)
@@ -305,3 +305,9 @@ class Rates:
             del self._left[next(iter(self._left))]  # the owner with the oldest last request
         if not allowed:
             raise problems.RATE_LIMITED(limit=rate, retry_after=math.ceil((1 - left) / rate))
+
+    def give_back(self, owner: str) -> None:
+        """Return the token of a request that does not count."""
+        if owner in self._left:
+            left, seen = self._left[owner]
+            self._left[owner] = left + 1, seen

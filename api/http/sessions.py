@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
-from collections import OrderedDict, deque
-from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request, Response
@@ -17,49 +14,9 @@ from api.http.schemas import SessionView, SignIn, subpath
 from service import problems
 from service.problems import ServiceError
 
-#: Maximum number of failed attempts from one address, and the seconds within which they count.
-MOST_FAILURES, WITHIN_SECONDS = 10, 60.0
-#: Maximum number of remembered addresses. Beyond it, the address with the oldest last failure is forgotten.
-_MOST_ADDRESSES = 10_000
-
-
-class SignIns:
-    """Counter of failed sign-ins by address, in the memory of this process.
-
-    Failures are not stored in the database. Keys of 256 bits cannot be guessed anyway, and attackers could fill the
-    database with rows of failed attempts.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._failures: OrderedDict[str, deque[float]] = OrderedDict()
-
-    def attempt(self, address: str) -> None:
-        """Count an attempt as failed until its outcome is known, so that parallel attempts cannot pass the limit.
-
-        Raises:
-            TOO_MANY_TRIES: If the address has failed too often recently.
-        """
-        failures = self._failures.setdefault(address, deque(maxlen=MOST_FAILURES))
-        if len(failures) == MOST_FAILURES:
-            left = failures[0] + WITHIN_SECONDS - self._clock()
-            if left > 0:
-                raise problems.TOO_MANY_TRIES(retry_after=int(left) + 1)
-        failures.append(self._clock())
-        self._failures.move_to_end(address)
-        if len(self._failures) > _MOST_ADDRESSES:
-            self._failures.popitem(last=False)
-
-    def withdraw(self, address: str) -> None:
-        """Forget the newest attempt of an address, whose key could not be looked up."""
-        failures = self._failures.get(address)
-        if failures:
-            failures.pop()
-
-    def succeeded(self, address: str) -> None:
-        """Forget the failures of an address."""
-        self._failures.pop(address, None)
-
+#: Number of failed attempts from one address until it has one in so many seconds. They are not stored in the database:
+#: keys of 256 bits cannot be guessed anyway, and attackers could fill it with rows.
+MOST_FAILURES, SECONDS_A_TRY = 10, 60.0
 
 router = APIRouter(prefix="/v1/session", tags=["session"])
 
@@ -88,15 +45,18 @@ async def sign_in(
     (`SGSST_SESSION_DAYS`), with `DELETE`, or when its key is revoked.
     """
     address = request.client.host if request.client else ""
-    context.sign_ins.attempt(address)
+    try:  # counted as failed until the outcome is known, so that parallel attempts cannot pass the limit
+        context.sign_ins.take(address, 1 / SECONDS_A_TRY, MOST_FAILURES)
+    except ServiceError as error:
+        raise problems.TOO_MANY_TRIES(retry_after=error.retry_after) from None
     try:
         key = await asyncio.to_thread(context.store.keys.find, sign_in.key)
     except ServiceError:
-        context.sign_ins.withdraw(address)
+        context.sign_ins.give_back(address)
         raise
     if key is None:
         raise problems.UNKNOWN_KEY()
-    context.sign_ins.succeeded(address)
+    context.sign_ins.give_back(address)
     await _end(request, context)
     text = await asyncio.to_thread(context.store.sessions.create, key.id)
     return _cookie_answer(request, text, int(context.store.sessions.seconds))
