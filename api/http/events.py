@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections import deque
 from collections.abc import AsyncIterator, Coroutine, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -30,30 +29,21 @@ from service.store.tables import EventRow
 _POLL_SECONDS = 0.3
 #: Seconds without an event after which a comment is sent, so that proxies do not drop the connection as idle.
 HEARTBEAT_SECONDS = 15.0
-#: Number of events that are buffered per watched job. A watcher that is farther behind reads the database.
-_BUFFERED = 300
-
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Item:
-    """Server-sent event of a job, ready to be sent."""
-
-    id: int
-    text: bytes
-    ends: bool
-
-
 @dataclass
-class _Channel:
-    """Newest event, recent events and watchers of one job."""
+class _Watched:
+    """Job with watchers.
 
-    last: int = 0
-    items: deque[Item] = field(default_factory=lambda: deque(maxlen=_BUFFERED))
+    Attributes:
+        newest: Number of its newest event at the last poll; 0 before the first one, None if the job was deleted.
+        changed: Event that is set when there are newer events, and then replaced.
+    """
+
+    newest: int | None = 0
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     watchers: int = 0
-    deleted: bool = False
 
 
 class Hub:
@@ -61,9 +51,9 @@ class Hub:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._channels: dict[str, _Channel] = {}
+        self._watched: dict[str, _Watched] = {}
         self._task: asyncio.Task[None] | None = None
-        self._closing = asyncio.Event()
+        self._closing = False
         #: Work that clients wait for, which is canceled when the service stops.
         self.working: set[asyncio.Task[Any]] = set()
 
@@ -73,11 +63,11 @@ class Hub:
 
     async def close(self) -> None:
         """End all streams and cancel work; watchers reconnect with the id of their last event."""
-        self._closing.set()
+        self._closing = True
         for task in self.working:
             task.cancel()
-        for channel in self._channels.values():
-            channel.changed.set()
+        for watched in self._watched.values():
+            watched.changed.set()
         if self._task is not None:
             self._task.cancel()
 
@@ -91,52 +81,50 @@ class Hub:
         if last is None or last > after:
             return after
         rows = await asyncio.to_thread(self._store.jobs.events, job_id, last - 1, 1)
-        if rows and _to_item(rows[0]).ends:
+        if rows and _ends(rows[0]):
             return None
         return after if after == last else 0
 
     async def watch(self, job_id: str, after: int) -> AsyncIterator[bytes]:
         """Yield the encoded events of a job after the one with id `after`, until the job has ended."""
-        channel = self._channels.setdefault(job_id, _Channel())
-        channel.watchers += 1
+        watched = self._watched.setdefault(job_id, _Watched())
+        watched.watchers += 1
+        ended = False
         try:
             yield b"retry: 2000\n\n"
-            while not self._closing.is_set() and not channel.deleted:
-                changed = channel.changed
-                items = await self._events_after(job_id, channel, after)
-                for item in items:
-                    yield item.text
-                    after = item.id
-                if items and items[-1].ends and channel.last <= after:
-                    return
-                if items:
+            while not self._closing and watched.newest is not None:
+                changed = watched.changed
+                rows = await self._events_after(job_id, after)
+                for row in rows:
+                    yield _text(row)
+                    after, ended = row.id, _ends(row)
+                if rows:
                     continue
+                if ended:
+                    return
                 try:
                     await asyncio.wait_for(changed.wait(), HEARTBEAT_SECONDS)
                 except TimeoutError:
                     yield b": still here\n\n"
         finally:
-            channel.watchers -= 1
-            if not channel.watchers:
-                self._channels.pop(job_id, None)
+            watched.watchers -= 1
+            if not watched.watchers:
+                self._watched.pop(job_id, None)
 
-    async def _events_after(self, job_id: str, channel: _Channel, after: int) -> list[Item]:
-        if channel.items and after >= channel.items[0].id:
-            return [item for item in channel.items if item.id > after]
+    async def _events_after(self, job_id: str, after: int) -> list[EventRow]:
         try:
-            rows = await asyncio.to_thread(self._store.jobs.events, job_id, after)
+            return await asyncio.to_thread(self._store.jobs.events, job_id, after)
         except DatabaseUnavailableError:  # The stream waits until the database is back.
             return []
-        return [_to_item(row) for row in rows]
 
     async def _poll(self) -> None:
         unavailable = False
         while True:
             await asyncio.sleep(_POLL_SECONDS)
-            if not self._channels:
+            if not self._watched:
                 continue
             try:
-                await self._read_new_events()
+                await self._find_new_events()
                 unavailable = False
             except DatabaseUnavailableError as error:  # Watchers wait until the database is back.
                 if not unavailable:
@@ -145,31 +133,26 @@ class Hub:
             except Exception:
                 _log.exception("reading events failed")
 
-    async def _read_new_events(self) -> None:
-        watched = dict(self._channels)
+    async def _find_new_events(self) -> None:
+        watched = dict(self._watched)
         newest = await asyncio.to_thread(self._store.jobs.last_events, list(watched))
-        for job_id, channel in watched.items():
-            number = newest.get(job_id)
-            if number is None:
-                channel.deleted = True
-            elif not channel.last:
-                channel.last = number
-            elif number > channel.last:
-                rows = await asyncio.to_thread(self._store.jobs.events, job_id, channel.last)
-                channel.items.extend(_to_item(row) for row in rows)
-                channel.last = rows[-1].id if rows else channel.last
-            else:
-                continue
-            changed, channel.changed = channel.changed, asyncio.Event()
-            changed.set()
+        for job_id, each in watched.items():
+            if each.newest != newest.get(job_id):
+                each.newest = newest.get(job_id)
+                changed, each.changed = each.changed, asyncio.Event()
+                changed.set()
 
 
-def _to_item(row: EventRow) -> Item:
+def _text(row: EventRow) -> bytes:
+    """Return an event as it is sent."""
     data = row.data
     if row.kind == "progress":  # same format as in responses that show the job
         data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
-    text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
-    return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in ENDED)
+    return f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n".encode()
+
+
+def _ends(row: EventRow) -> bool:
+    return row.kind == "status" and row.data["status"] in ENDED
 
 
 _EVENTS = "text/event-stream"
