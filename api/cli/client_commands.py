@@ -34,7 +34,7 @@ from api.cli.options import (
     with_arguments,
     with_options,
 )
-from api.client.uploads import different_names
+from api.client.client import different_names
 from service.inputs import JobParameters
 from service.states import ACTIONS, STEPPING, Transition, WebhookEvent
 from sgsst_core.errors import OutputError, SettingsError

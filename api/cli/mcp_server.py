@@ -21,8 +21,8 @@ from pydantic import BaseModel, Field
 
 from api import installed_version
 from api.client import AsyncClient
+from api.client.client import IMAGE_SUFFIXES, JobFiles, input_files
 from api.client.transport import Job
-from api.client.uploads import IMAGE_SUFFIXES, JobFiles, input_files
 from service.inputs import JobParameters
 from sgsst_core.errors import SgsstError
 from sgsst_core.files import formats

@@ -387,7 +387,7 @@ def batch(
 
     With --url, a service makes the results. Exit with 1 if any could not be made.
     """
-    from api.client.uploads import different_names
+    from api.client.client import different_names
 
     if url is None and key is not None:
         raise SettingsError("--key requires --url. Add it, or omit --key.")
@@ -422,7 +422,7 @@ def batch(
 
 def _names(paths: Sequence[Path]) -> list[str]:
     """Return the parts that files have in the names of results."""
-    from api.client.uploads import different_names
+    from api.client.client import different_names
 
     plain = [scene_path(path).parent if scene_path(path) != path else path.with_suffix("") for path in paths]
     return different_names(plain)
@@ -480,7 +480,7 @@ def _submitted(client: Client, job_id: str, name: str, request: JobSpec, options
 
 def _inputs(request: JobSpec) -> str:
     """Return the digest of everything that a result is made from: the contents of its files, and its options."""
-    from api.client.uploads import camera_files
+    from api.client.client import camera_files
 
     source, scene = request.source, scene_path(request.source.scene)
     digests = [file_digest(path) for path in (scene, *(image.path for image in request.styles))]

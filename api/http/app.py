@@ -21,7 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from api import installed_version
-from api.http import jobs, monitoring, sessions, shares, submission, uploads
+from api.http import jobs, monitoring, sessions, shares, submission
 from api.http.context import Context, Rates
 from api.http.events import Hub
 from api.http.monitoring import Metrics, Readiness
@@ -37,7 +37,7 @@ from api.http.problems import (
 )
 from api.http.receiving import Fetcher, Receipts
 from api.http.schemas import ANSWERS, path_of, subpath
-from api.http.static import add_static
+from api.http.sending import add_static
 from api.http.submission import JobFromUploads
 from service import problems
 from service.deadlines import Deadline, FileThreads, OwnerLimit
@@ -126,7 +126,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     app.settings = settings
     routers = [
         *(submission.router, jobs.router, jobs.inputs_router, jobs.artifacts_router, shares.router),
-        *(uploads.router, sessions.router, monitoring.router),
+        *(submission.uploads_router, sessions.router, monitoring.router),
     ]
     for router in routers:
         app.include_router(router)

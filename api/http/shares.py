@@ -17,8 +17,7 @@ from api.http.jobs import INPUT_POLICY, JobId, artifact_file, find, find_input, 
 from api.http.problems import headers, links, raises
 from api.http.receiving import json_body
 from api.http.schemas import NewShare, ShareCreated, SharedView, ShareList, address, share_view
-from api.http.sending import ConditionsDep, SentFile, file_answers, send_file
-from api.http.static import PAGE_HEADERS, shared_page, shared_policy
+from api.http.sending import PAGE_HEADERS, ConditionsDep, SentFile, file_answers, send_file, shared_page, shared_policy
 from service import problems
 from service.files.objects import media_type
 from service.inspection.derived import POSTER
