@@ -412,7 +412,7 @@ def paint(
 
 #: Options of a job that apply to all variants.
 _OF_VARIANTS = ("coarsest_side", "background", "backbone", "memory_limit", "seed")
-#: Width in characters of tables that a narrower terminal would truncate.
+#: Width in characters of a table that a narrower terminal would truncate.
 _TABLE_WIDTH = 180
 
 bench_app = typer.Typer(help="Benchmarks for your own scene and machine.", no_args_is_help=True)
@@ -444,7 +444,7 @@ class VariantsInputs:
 def error_time(
     inputs: VariantsInputs,
     out: Annotated[
-        Path, typer.Option(help="Folder for table, plot, JSON and scenes.", callback=folder_to_write)
+        Path, typer.Option(help="Folder for plot, JSON and scenes.", callback=folder_to_write)
     ] = Path("error_time"),
     variants: Annotated[str, typer.Option(help="Names of variants, separated by commas. [default: all]")] = "",
     *,
@@ -452,11 +452,10 @@ def error_time(
     chosen: StylizeOptions,
 ) -> None:
     """Run variants of a job for the same time each, and plot the remaining error against time."""
-    from api.cli.scene_tools import error_time_table, point_line, run_error_time
+    from api.cli.scene_tools import point_line, run_error_time
 
     request = inputs.request(options, chosen, variants, out)
-    curves = run_error_time(request, lambda curve: error_console.print(point_line(curve)))
-    Console(width=_TABLE_WIDTH).print(error_time_table(curves))
+    curves = run_error_time(request, lambda curve: out_console.print(point_line(curve)))
     _print_skipped_variants(curves, out)
 
 

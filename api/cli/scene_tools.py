@@ -409,31 +409,6 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def error_time_table(curves: Sequence[Curve]) -> Table:
-    """Return a table of each variant's remaining loss over time, and of its final loss by scale and judgment."""
-    shown = [curve for curve in curves if curve.points]
-    scales = sorted({scale for curve in shown for scale in curve.points[-1].by_scale})
-    moments = [f"{point.seconds:.0f} s" for point in shown[0].points] if shown else []
-    table = Table(
-        Column("variant", no_wrap=True),
-        *moments,
-        *(f"scale {scale}" for scale in scales),
-        "style",
-        "color_distance",
-        "steps",
-        title="remaining loss, relative to the start, and judgment of the end",
-    )
-    for curve in curves:
-        if not curve.points:
-            continue
-        losses = [_number(point.relative) for point in curve.points]
-        end = curve.points[-1]
-        ends = [end.by_scale[scale] for scale in scales]
-        judged = [end.judgment.style, end.judgment.color_distance] if end.judgment else [None, None]
-        table.add_row(curve.variant.name, *losses, *(_number(value) for value in (*ends, *judged)), str(end.step))
-    return table
-
-
 def point_line(curve: Curve) -> str:
     """Return the last evaluation of a curve as a line for a log."""
     name, point = curve.variant.name, curve.points[-1]

@@ -209,7 +209,7 @@ def test_names_that_are_too_long_are_refused(files: Files, sgsst: Sgsst) -> None
         ),
     ],
 )
-def test_bench_writes_table_plots_and_scenes(files: Files, sgsst: Sgsst, kind: str, written: set[str]) -> None:
+def test_bench_writes_plots_and_scenes(files: Files, sgsst: Sgsst, kind: str, written: set[str]) -> None:
     folder = files.out.with_name("bench")
     command = ["bench", kind, str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
     command += ["--backbone", "vgg16", "--out", str(folder), "--coarsest-side", "24"]
