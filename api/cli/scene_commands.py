@@ -443,9 +443,9 @@ class VariantsInputs:
 @with_arguments(VariantsInputs)
 def error_time(
     inputs: VariantsInputs,
-    out: Annotated[
-        Path, typer.Option(help="Folder for plot, JSON and scenes.", callback=folder_to_write)
-    ] = Path("error_time"),
+    out: Annotated[Path, typer.Option(help="Folder for plot, JSON and scenes.", callback=folder_to_write)] = Path(
+        "error_time"
+    ),
     variants: Annotated[str, typer.Option(help="Names of variants, separated by commas. [default: all]")] = "",
     *,
     options: ViewOptions,
