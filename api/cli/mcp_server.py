@@ -43,6 +43,8 @@ _SUFFIXES = {
     "cameras": (".json", ".bin", ".txt"),
     "photos": IMAGE_SUFFIXES,
 }
+#: What an estimate tells of a plan.
+_ESTIMATED = ("total_seconds", "memory_bytes", "gaussians", "views", "warnings")
 _READS = ToolAnnotations(read_only_hint=True, open_world_hint=False)
 _CREATES = ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
 
@@ -70,16 +72,6 @@ Out = Annotated[
 ]
 
 
-class Estimate(BaseModel):
-    """Time, memory and size of a job that was not queued."""
-
-    total_seconds: float | None
-    memory_bytes: int | None
-    gaussians: int
-    views: int
-    warnings: list[str]
-
-
 class State(BaseModel):
     """State of a job."""
 
@@ -104,21 +96,6 @@ class JobResult(BaseModel):
     path: str | None
 
 
-class Blended(BaseModel):
-    """Stored blend."""
-
-    url: str
-    path: str | None
-
-
-class Link(BaseModel):
-    """Link to a result."""
-
-    url: str
-    embed_url: str | None
-    expires_at: str
-
-
 class Tools:
     """Tools of the MCP server. Expected errors become messages to the model.
 
@@ -131,12 +108,12 @@ class Tools:
 
     async def estimate(
         self, scene: Scene, style: Styles, cameras: Cameras = None, photos: Photos = None, options: Options = None
-    ) -> Estimate:
+    ) -> dict[str, Any]:
         """Check the files of a job and estimate its time and memory, without queueing it."""
         with _messages():
             files = await anyio.to_thread.run_sync(self._files, scene, style, cameras, photos)
             plan = await self._client.plan(**files, **_known(options))
-        return Estimate(**{name: plan[name] for name in Estimate.model_fields})
+        return {name: plan[name] for name in _ESTIMATED}
 
     async def submit(
         self, scene: Scene, style: Styles, cameras: Cameras = None, photos: Photos = None, options: Options = None
@@ -178,14 +155,14 @@ class Tools:
             dict[str, float] | None, Field(description="Weights of results of other jobs of the scene by job ID.")
         ] = None,
         out: Out = None,
-    ) -> Blended:
+    ) -> dict[str, str | None]:
         """Blend the scene of a finished job with its result, and with results of other jobs of the scene."""
         with _messages():
             target = self._new_file(out, [each.suffix for each in formats.RESULT_FORMATS])
             format = formats.format_of_name(target.name) if target else None
             name = await self._client.blend(job_id, weight, others, (format or PLY).name)
             path = target and str(await self._client.download(job_id, target, name))
-        return Blended(url=self._address(job_id, name), path=path)
+        return {"url": self._address(job_id, name), "path": path}
 
     async def share(
         self,
@@ -194,11 +171,11 @@ class Tools:
         poster: Annotated[
             bool, Field(description="Whether sites where the link is posted can show an image of the result.")
         ] = False,
-    ) -> Link:
+    ) -> dict[str, str | None]:
         """Create a read-only link to the result of a job, for people without a key."""
         with _messages():
             link = await self._client.share(job_id, days, poster=poster)
-        return Link(**{name: link[name] for name in Link.model_fields})
+        return {name: link[name] for name in ("url", "embed_url", "expires_at")}
 
     def _address(self, job_id: str, name: str) -> str:
         return f"{self._client.url}/v1/jobs/{job_id}/artifacts/{name}"

@@ -5,7 +5,6 @@ Results are compared by benchmarks on one's own scene and machine (`bench`), and
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,7 +34,7 @@ from api.cli.options import (
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
-from sgsst_core.progress import clock, duration
+from sgsst_core.progress import duration
 from sgsst_core.stylizing.progress_bar import job_bar, live_bar
 from worker.job import JobSpec, SceneRequest
 from worker.options import (
@@ -53,9 +52,6 @@ if TYPE_CHECKING:
     from api.cli.scene_tools import VariantsRequest
     from sgsst_core.bench.variants import Curve
     from worker.derived import VideoRequest
-
-#: Number of frames after which the time of a video is estimated.
-_TIMED_FRAMES = 6
 
 
 @with_options(StylizeOptions, without=("workers",))
@@ -197,17 +193,7 @@ def _render_video(request: VideoRequest) -> None:
 
     check_video_request(request)
     with _frame_bar() as progress:
-        first: float | None = None
-
-        def show(done: int, total: int) -> None:
-            nonlocal first
-            progress(done, total)
-            first = first or time.monotonic()  # the first frame also compiles kernels
-            if done == min(_TIMED_FRAMES, total) and done > 1:
-                seconds = (time.monotonic() - first) / (done - 1) * total
-                error_console.print(f"Rendering {total} frames, which takes about {clock(seconds)}.")
-
-        cameras = render_video(request, show, _print_warning)
+        cameras = render_video(request, progress, _print_warning)
     frames, fps, size = len(cameras), request.options.fps, f"{cameras[0].width}x{cameras[0].height}"
     out_console.print(f"{frames} frames of {size}, {frames / fps:.3g} s at {fps} per second, in {request.out}")
 

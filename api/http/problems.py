@@ -41,7 +41,6 @@ from sgsst_core.errors import (
     TooManyIntersectionsError,
     WeightsError,
 )
-from sgsst_core.files.formats import listed
 from sgsst_core.settings import merged, reason, unknown_text
 from worker.options import RegionOptions
 
@@ -424,10 +423,13 @@ def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any
             body = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
             operation["requestBody"] = {"required": True, "content": {"application/json": body}}
     raised += [problem for part, problem in _OF_PATHS.items() if part in route.path]
-    invalid = [each for parameter in operation.get("parameters", []) if (each := _invalid(parameter))]
+    checked = [each["name"] for each in operation.get("parameters", []) if _is_limited(each)]
     if "application/json" in operation.get("requestBody", {}).get("content", {}):
-        invalid.append(_invalid_example("body", "is not JSON: Expecting value: line 1 column 1 (char 0)."))
-    raised += [*invalid[:1], *_OF_OPERATIONS.get(operation["operationId"].replace("head_", "get_"), ())]
+        checked.append("body")
+    if checked:
+        errors = [{"at": checked[0], "message": "is not valid"}]
+        raised.append(problems.INVALID_REQUEST(f"{checked[0]}: is not valid", errors=errors))
+    raised += _OF_OPERATIONS.get(operation["operationId"].replace("head_", "get_"), ())
     responses = operation["responses"]
     responses.pop("422", None)  # FastAPI's own error schema
     for problem in raised:
@@ -442,23 +444,11 @@ def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any
         response.setdefault("headers", {}).update(headers(*names))
 
 
-def _invalid(parameter: dict[str, Any]) -> ServiceError | None:
-    """Return an example error for a parameter; None if every value of it is valid."""
+def _is_limited(parameter: dict[str, Any]) -> bool:
+    """Return whether there are values that a parameter may not have."""
     schema = parameter["schema"]
-    schema = schema | schema.get("anyOf", [{}])[0]
-    at = parameter["name"]
-    if "le" in schema or "lt" in schema:
-        bound = "or equal to " if "le" in schema else ""
-        return _invalid_example(at, f"Input should be less than {bound}{schema.get('le', schema.get('lt'))}")
-    if "pattern" in schema and "const" not in schema:
-        return _invalid_example(at, f"String should match pattern '{schema['pattern']}'")
-    if "maxLength" in schema:
-        return _invalid_example(at, f"String should have at most {schema['maxLength']} characters")
-    return _invalid_example(at, f"Input should be {listed([*map(repr, schema['enum'])])}") if "enum" in schema else None
-
-
-def _invalid_example(at: str, message: str) -> ServiceError:
-    return problems.INVALID_REQUEST(f"{at}: {message}", errors=[{"at": at, "message": message}])
+    known = schema.keys() | schema.get("anyOf", [{}])[0].keys()
+    return "const" not in known and not known.isdisjoint(("le", "lt", "pattern", "maxLength", "enum"))
 
 
 def links(*operations: str, **parameters: str) -> dict[str, Any]:
