@@ -298,10 +298,6 @@ class AsyncClient:
         name: str = video["name"]
         return name
 
-    async def rename(self, job_id: str, name: str) -> Job:
-        """Change the display name of a job; an empty name restores the names of scene and style."""
-        return Job.of((await self._transport.call("PATCH", _job_path(job_id), json={"name": name})).json())
-
     async def usage(self, since: str | None = None, until: str | None = None) -> list[dict[str, Any]]:
         """Return the usage of the key by day; with an operator's key, or without keys, that of all keys.
 
@@ -343,17 +339,6 @@ class AsyncClient:
             if share.get(name):
                 share[name] = f"{self.url}/shared{share[name].rpartition('/shared')[2]}"
         return share
-
-    async def shares(self, job_id: str) -> list[dict[str, Any]]:
-        """Return the links to a result that have not expired, without their addresses."""
-        shares: list[dict[str, Any]] = (await self._transport.call("GET", f"{_job_path(job_id)}/shares")).json()[
-            "shares"
-        ]
-        return shares
-
-    async def revoke_share(self, job_id: str, share_id: str) -> None:
-        """Revoke a link to a result."""
-        await self._transport.call("DELETE", f"{_job_path(job_id)}/shares/{share_id}")
 
     async def delete(self, job_id: str) -> None:
         """Delete a job that has ended, with its results."""
@@ -467,15 +452,12 @@ class Client:
     download = _blocking(AsyncClient.download)
     blend = _blocking(AsyncClient.blend)
     video = _blocking(AsyncClient.video)
-    rename = _blocking(AsyncClient.rename)
     usage = _blocking(AsyncClient.usage)
     act = _blocking(AsyncClient.act)
     finish = _blocking(AsyncClient.finish)
     cancel = _blocking(AsyncClient.cancel)
     retry = _blocking(AsyncClient.retry)
     share = _blocking(AsyncClient.share)
-    shares = _blocking(AsyncClient.shares)
-    revoke_share = _blocking(AsyncClient.revoke_share)
     delete = _blocking(AsyncClient.delete)
 
 

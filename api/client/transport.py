@@ -23,10 +23,8 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 #: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
 TRIES = 6
 
-#: Variables of the environment that name proxies, and hosts to reach without them.
-_PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY")
-#: Variables that name files for encrypted connections.
-_CERTIFICATES = ("SSL_CERT_FILE", "SSLKEYLOGFILE")
+#: Variables of the environment that name proxies, hosts to reach without them, and files for encrypted connections.
+_ENVIRONMENT = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY", "SSL_CERT_FILE", "SSLKEYLOGFILE")
 #: Methods of requests that change nothing.
 _READS = ("GET", "HEAD")
 
@@ -254,7 +252,8 @@ class Transport:
     def unreachable(self, error: Exception) -> ApiError:
         """Return the error for a service that did not respond."""
         proxy = _proxy_for(self.url)
-        through = f" through the proxy {_without_password(proxy)} (NO_PROXY excludes hosts)" if proxy else ""
+        named = proxy and httpx2.URL(proxy).copy_with(userinfo=b"")
+        through = f" through the proxy {named} (NO_PROXY excludes hosts)" if proxy else ""
         return ApiError(
             f"{self.url} cannot be reached{through}: {error}. Is `sgsst serve` running? --url names another address."
         )
@@ -288,13 +287,11 @@ def _http_client(url: str, headers: dict[str, str]) -> httpx2.AsyncClient:
     try:
         proxy = _proxy_for(url)
         if proxy.startswith("http") and not _is_address(proxy):
-            raise ValueError(f"{_without_password(proxy)} is no address")
+            raise ValueError("the proxy has no address that is possible")
         return httpx2.AsyncClient(base_url=url, headers=headers, timeout=httpx2.Timeout(30.0, read=900.0, write=120.0))
     except Exception as error:  # httpx2 raises errors of many types here, some of them built-in
-        names = _CERTIFICATES if isinstance(error, OSError) else _PROXIES
-        given = {name: value for name, value in sorted(os.environ.items()) if name.upper() in names and value}
-        shown = " or ".join(f"{name}={_without_password(value)}" for name, value in given.items())
-        raise RequestError(f"{shown} cannot be used: {str(error).rstrip('.')}. Correct or unset it.") from error
+        given = " or ".join(name for name in sorted(os.environ) if name.upper() in _ENVIRONMENT and os.environ[name])
+        raise RequestError(f"{given} cannot be used: {str(error).rstrip('.')}. Correct or unset it.") from error
 
 
 def _proxy_for(url: str) -> str:
@@ -304,11 +301,6 @@ def _proxy_for(url: str) -> str:
     if not proxy or urllib.request.proxy_bypass(parsed.host):
         return ""
     return proxy if "://" in proxy else f"http://{proxy}"
-
-
-def _without_password(address: str) -> str:
-    """Return the address of a proxy without its user and password."""
-    return re.sub(r"^(\w+://)?.*@", r"\1", address)
 
 
 def json_text(value: object) -> str:

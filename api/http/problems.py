@@ -6,7 +6,6 @@ bodies are defined with their models (`api.http.schemas`, `api.http.submission`,
 
 from __future__ import annotations
 
-import copy
 import errno
 import json
 import logging
@@ -437,7 +436,7 @@ def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any
         answer = from_service(example)
         document = json.loads(bytes(answer.body))
         response = responses.setdefault(str(example.status), {"description": f"{document['title']}: see `code`."})
-        schema = {"$ref": f"#/components/schemas/Problem{example.status}"}  # see `complete`
+        schema = {"$ref": "#/components/schemas/Problem"}
         content = response.setdefault("content", {}).setdefault(MEDIA_TYPE, {"schema": schema, "examples": {}})
         content["examples"][example.code] = {"value": document}
         names = [name for name in _HEADERS if name.lower() in answer.headers and name != "Content-Length"]
@@ -460,8 +459,7 @@ def complete(document: dict[str, Any], routes: Sequence[BaseRoute], models: Sequ
     """Complete FastAPI's OpenAPI document in place.
 
     FastAPI omits models that no route takes as an argument, drops nulls from examples, and has its own error schemas.
-    Generators of clients support neither schemas that narrow another one nor constants in headers, and use the first
-    media type of a response.
+    Generators of clients do not support constants in headers, and use the first media type of a response.
     """
     schemas = document["components"]["schemas"]
     for model in models:
@@ -483,7 +481,6 @@ def complete(document: dict[str, Any], routes: Sequence[BaseRoute], models: Sequ
                     answer["content"] = {"application/json": None, **answer["content"]}
                 if method == "head":
                     answer.pop("content", None)
-    _add_problem_schemas(document)
     for unused in ("HTTPValidationError", "ValidationError"):
         schemas.pop(unused, None)
 
@@ -492,22 +489,3 @@ def _add_schema(schemas: dict[str, Any], model: type[BaseModel]) -> None:
     schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
     schemas |= schema.pop("$defs", {})
     schemas[model.__name__] = schema
-
-
-def _add_problem_schemas(document: dict[str, Any]) -> None:
-    """Add a schema for the problems of each status, with all codes that any operation documents for it."""
-    schemas = document["components"]["schemas"]
-    examples: dict[int, dict[str, Any]] = {}
-    for path in document["paths"].values():
-        for operation in path.values():
-            for status, answer in operation["responses"].items():
-                problem = answer.get("content", {}).get(MEDIA_TYPE)
-                if problem:
-                    known = {code: example["value"] for code, example in problem["examples"].items()}
-                    examples.setdefault(int(status), {}).update(known)
-    for status, by_code in sorted(examples.items()):
-        properties = copy.deepcopy(schemas["Problem"]["properties"])
-        properties["status"] |= {"const": status}
-        properties["code"] |= {"enum": sorted(by_code)}
-        title = {"title": f"Problem{status}", "examples": [next(iter(by_code.values()))]}
-        schemas[f"Problem{status}"] = {**schemas["Problem"], "properties": properties, **title}
