@@ -47,7 +47,6 @@ from api.cli.options import (
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, WeightsError, is_out_of_memory
 from sgsst_core.files.atomic import file_digest, write_json
 from sgsst_core.files.formats import EXTRA_SUFFIXES, SUFFIXES, scene_path
-from sgsst_core.progress import clock
 from sgsst_core.settings import declared
 from sgsst_core.stylizing.progress_bar import job_bar
 from worker.job import JobSpec, Result
@@ -184,8 +183,6 @@ def _print_result(outputs: Outputs, result: Result, command: str) -> None:
     assert result.loss_after is not None
     print_field("loss", loss_text(result.loss_before, result.loss_after))
     print_field("loss measured", f"before on {result.loss_views} views, after in the steps of the last round of views")
-    for line in _loss_over_time(result):
-        print_field("loss over time", line)
     if result.loss_over_time and (more := result.loss_over_time["more_time"]):
         print_field("more time", more["text"])
     paths = [("stylized scene", outputs.ply)]
@@ -210,21 +207,6 @@ def _print_result(outputs: Outputs, result: Result, command: str) -> None:
             f"The stylized scene is complete, but its report could not be written: {result.report_error}"
         )
         raise typer.Exit(FAILURE)
-
-
-def _loss_over_time(result: Result) -> list[str]:
-    """Return when the loss fell to certain fractions of its initial value, and its decrease at the end."""
-    loss_over_time = result.loss_over_time
-    if loss_over_time is None:
-        return []
-    lines = [
-        f"down to {entry['relative']:.0%} of the initial loss on all scales after {clock(entry['seconds'])}"
-        for entry in loss_over_time["reached"]
-    ]
-    last = loss_over_time["last_tenth"]
-    if last:
-        lines.append(f"from {last['from']:.2%} to {last['to']:.2%} in the last tenth of the time")
-    return lines
 
 
 class StopFlag:

@@ -153,8 +153,7 @@ class _App(FastAPI):
 
     def build_middleware_stack(self) -> ASGIApp:
         """Return the app with all middleware."""
-        inner = Methods(super().build_middleware_stack())
-        return Observed(Proxied(inner, self.settings), self.state)
+        return Observed(Adapted(super().build_middleware_stack(), self.settings), self.state)
 
 
 #: Path of the uploads, whose protocol lets a header replace the method, for clients that can only send GET and POST.
@@ -211,10 +210,13 @@ class Observed:
         _access.info("request", extra={**extra, "request_id": request["request_id"]})
 
 
-class Proxied:
+class Adapted:
     """Middleware that takes the client's address, the scheme and the subpath of a request from a trusted proxy.
 
     The proxy may pass the subpath on or strip it. A subpath in the settings replaces the proxy's.
+
+    It also chooses the method by which the routes answer. HEAD is answered wherever GET is: with the same headers, and
+    without the body.
     """
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
@@ -229,6 +231,10 @@ class Proxied:
             scope["root_path"] = root
             if not f"{scope['path']}/".startswith(f"{root}/"):
                 scope["path"] = root + scope["path"]
+            if f"{path_of(scope)}/".startswith(f"{_UPLOADS}/"):
+                scope["method"] = _header(scope, b"x-http-method-override") or scope["method"]
+            if scope["method"] == "HEAD" and "GET" in (routed := routed_methods(scope)) and "HEAD" not in routed:
+                scope["method"], send = "GET", _head_of(send)
         await self._app(scope, receive, send)  # type: ignore[arg-type]
 
     def _forwarded(self, scope: Scope) -> str:
@@ -238,25 +244,6 @@ class Proxied:
             return ""
         prefix = _header(scope, b"x-forwarded-prefix").rstrip("/")
         return prefix if is_subpath(prefix) else ""
-
-
-class Methods:
-    """Middleware that chooses the method by which the routes answer a request.
-
-    HEAD is answered wherever GET is: with the same headers, and without the body.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request."""
-        if scope["type"] == "http":
-            if f"{path_of(scope)}/".startswith(f"{_UPLOADS}/"):
-                scope["method"] = _header(scope, b"x-http-method-override") or scope["method"]
-            if scope["method"] == "HEAD" and "GET" in (routed := routed_methods(scope)) and "HEAD" not in routed:
-                scope["method"], send = "GET", _head_of(send)
-        await self._app(scope, receive, send)
 
 
 class Deadlines:

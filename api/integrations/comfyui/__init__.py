@@ -1,4 +1,4 @@
-"""Nodes of ComfyUI: stylize a Gaussian splat on a service of sgsst, blend two, and render views of a stylized one."""
+"""Nodes of ComfyUI: stylize a Gaussian splat on a service of sgsst, and blend two."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import torch
 from comfy import model_management
@@ -182,47 +181,12 @@ class Blend(IO.ComfyNode):
         return IO.NodeOutput(_with_colors(original, torch.lerp(first, second.to(first), weight)))
 
 
-class RenderViews(IO.ComfyNode):
-    """Node that renders a job's result with the rasterizer of the service."""
-
-    @classmethod
-    def define_schema(cls) -> Any:
-        """Return inputs and outputs of the node."""
-        return IO.Schema(
-            node_id="SgsstRenderViews",
-            display_name="Render Views (SGSST)",
-            category=_CATEGORY,
-            description="Render views of a stylized splat on a full turn around it, as the service shows them.",
-            inputs=[
-                IO.String.Input("job", force_input=True, tooltip="Output `job` of Stylize Splat."),
-                IO.Int.Input("frames", default=24, min=1, max=240, tooltip="1 for a still image."),
-                IO.Int.Input("resolution", default=1024, min=64, max=1920, tooltip="Longer side in pixels."),
-                IO.Boolean.Input("compare", default=False, tooltip="Start with the unstylized splat."),
-                _service_input(),
-            ],
-            outputs=[IO.Image.Output(display_name="images")],
-        )
-
-    @classmethod
-    def execute(cls, job: str, frames: int, resolution: int, compare: bool, service: str = "") -> Any:
-        """Return the images, [frames, height, width, 3]."""
-        connection = Service(service)
-        # The service renders at most 60 frames per second and 30 seconds.
-        fps = min(24, frames)
-        video = {"path": "orbit", "fps": fps, "seconds": frames / fps, "resolution": resolution, "compare": compare}
-        connection.json("POST", f"/v1/jobs/{job}/video", video)
-        with connection.request("GET", f"/v1/jobs/{job}/artifacts/video.mp4") as answer:
-            content = io.BytesIO(answer.read())
-        with av.open(content, "r") as container:
-            return IO.NodeOutput(torch.cat([_tensor(frame.to_image()) for frame in container.decode(video=0)]))
-
-
 class Extension(ComfyExtension):
     """Nodes of this package."""
 
     async def get_node_list(self) -> list[type[Any]]:
         """Return the classes of all nodes."""
-        return [Stylize, Blend, RenderViews]
+        return [Stylize, Blend]
 
 
 async def comfy_entrypoint() -> Extension:
