@@ -265,61 +265,47 @@ class Deadlines:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        await _Exchange(self._app, self._seconds, scope, receive, send).run()
+        complete = started = over = False
+        expired: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        deadline, cancel = Deadline(self._seconds, lambda: expired.set_result(None)), anyio.CancelScope()
 
+        async def from_client() -> Message:
+            nonlocal complete
+            if complete:  # the app waits for the client to leave
+                return await receive()
+            with deadline.suspended():
+                message = await receive()
+            complete = not message.get("more_body", False)
+            return message
 
-class _Exchange:
-    """Request and its response."""
+        async def to_client(message: Message) -> None:
+            nonlocal started
+            if over:
+                return
+            started = True
+            with deadline.suspended():
+                await send(message)
 
-    def __init__(self, app: ASGIApp, seconds: float, scope: Scope, receive: Receive, send: Send) -> None:
-        self._app, self._seconds, self._scope = app, seconds, scope
-        self._from_client, self._to_client = receive, send
-        self._complete = self._started = self._over = False
-        self._cancel = anyio.CancelScope()
-        self._expired = asyncio.get_running_loop().create_future()
+        async def serve() -> None:
+            with cancel:
+                await self._app(scope, from_client, to_client)
 
-    async def run(self) -> None:
-        self._deadline = Deadline(self._seconds, lambda: self._expired.set_result(None))
-        serving = asyncio.create_task(self._serve())
+        serving = asyncio.create_task(serve())
         try:
-            await asyncio.wait((serving, self._expired), return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait((serving, expired), return_when=asyncio.FIRST_COMPLETED)
             if serving.done():
                 await serving
-            else:
-                await self._expire(serving)
-        finally:
-            self._deadline.close()
-            self._cancel.cancel()
-
-    async def _serve(self) -> None:
-        with self._cancel:
-            await self._app(self._scope, self._receive, self._send)
-
-    async def _expire(self, serving: asyncio.Task[None]) -> None:
-        """Give the request up, and answer it if no response has started; otherwise the server closes the connection."""
-        self._over = True
-        serving.add_done_callback(lambda task: task.cancelled() or task.exception())  # it ends without an audience
-        method, path = self._scope["method"], logged_path(self._scope)
-        _log.warning("no progress for %g s, request given up: %s %s", self._seconds, method, path)
-        if not self._started:
-            await from_service(problems.DEADLINE_EXCEEDED(seconds=self._seconds))(
-                self._scope, self._from_client, self._to_client
+                return
+            over = True
+            serving.add_done_callback(lambda task: task.cancelled() or task.exception())  # it ends without an audience
+            _log.warning(
+                "no progress for %g s, request given up: %s %s", self._seconds, scope["method"], logged_path(scope)
             )
-
-    async def _receive(self) -> Message:
-        if self._complete:  # the app waits for the client to leave
-            return await self._from_client()
-        with self._deadline.suspended():
-            message = await self._from_client()
-        self._complete = not message.get("more_body", False)
-        return message
-
-    async def _send(self, message: Message) -> None:
-        if self._over:
-            return
-        self._started = True
-        with self._deadline.suspended():
-            await self._to_client(message)
+            if not started:  # otherwise the server closes the connection
+                await from_service(problems.DEADLINE_EXCEEDED(seconds=self._seconds))(scope, receive, send)
+        finally:
+            deadline.close()
+            cancel.cancel()
 
 
 def _head_of(send: Send) -> Send:

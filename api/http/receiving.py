@@ -14,8 +14,8 @@ import gc
 import json
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import PurePosixPath
@@ -166,6 +166,7 @@ _DRAIN_BYTES, _DRAIN_SECONDS = 64 << 20, 10.0
 
 
 Model = TypeVar("Model", bound=BaseModel)
+Value = TypeVar("Value")
 
 
 @dataclass
@@ -589,11 +590,15 @@ class Fetcher:
     async def _fetch(self, source: _Input, state: _Fetch) -> str:
         """Fetch one file, and return its SHA-256."""
         async with AsyncExitStack() as stack:
-            chunks = await self._open(source, state, stack)
+            response = await self._open(source, state, stack)
+            declared = int(response.headers.get("content-length", "0"))  # only digits: h11 refuses anything else
+            self._check_size(declared, state)
+            await asyncio.to_thread(state.receipt.charge, declared)
+            chunks = response.aiter_raw(memory.share())
             run = partial(self.threads.run, state.receipt.owner)
             file = await run(self._blobs.receive, self._settings.max_upload_bytes)
             try:
-                while chunk := await self._next(source, state, chunks):
+                while chunk := await self._in_time(source, state, anext(chunks, b"")):
                     state.left -= len(chunk)
                     self._check_size(0, state)
                     await run(_write, chunk, file, state.receipt)
@@ -605,17 +610,19 @@ class Fetcher:
             _log.info("input fetched: host=%s bytes=%d", parse_url(source.url).host, file.size)
             return sha256
 
-    async def _open(self, source: _Input, state: _Fetch, stack: AsyncExitStack) -> AsyncIterator[bytes]:
-        """Follow redirects to the file, and return its chunks. The stack closes the connection."""
+    async def _open(self, source: _Input, state: _Fetch, stack: AsyncExitStack) -> httpx2.Response:
+        """Follow redirects to the file, and return the response with it. The stack closes the connection."""
         url = self._parse(source.url, source)
         for _ in range(1 + _MAX_REDIRECTS):
             answer = send("GET", url, _HEADERS, private_allowed=self._settings.url_private_addresses)
-            with self._failures(source):
-                async with asyncio.timeout_at(state.deadline):
-                    response = await stack.enter_async_context(answer)
+            response = await self._in_time(source, state, stack.enter_async_context(answer))
             location = response.headers.get("location")
             if response.status_code not in _REDIRECTS or location is None:
-                return await self._body(source, state, response)
+                if response.status_code != httpx2.codes.OK:
+                    raise _not_fetched(source, f"the server answered {response.status_code}")
+                if response.headers.get("content-encoding", "identity").strip().lower() != "identity":
+                    raise _not_fetched(source, "the server compresses the file")
+                return response
             await stack.aclose()
             try:
                 target = str(url.join(location))
@@ -624,23 +631,6 @@ class Fetcher:
             url = self._parse(target, source)
         raise _not_fetched(source, f"the server redirects more than {_MAX_REDIRECTS} times")
 
-    async def _body(self, source: _Input, state: _Fetch, response: httpx2.Response) -> AsyncIterator[bytes]:
-        """Check the head of a response, and return the chunks of its body."""
-        if response.status_code != httpx2.codes.OK:
-            raise _not_fetched(source, f"the server answered {response.status_code}")
-        if response.headers.get("content-encoding", "identity").strip().lower() != "identity":
-            raise _not_fetched(source, "the server compresses the file")
-        declared = int(response.headers.get("content-length", "0"))  # only digits: h11 refuses anything else
-        self._check_size(declared, state)
-        await asyncio.to_thread(state.receipt.charge, declared)
-        return response.aiter_raw(memory.share())
-
-    async def _next(self, source: _Input, state: _Fetch, chunks: AsyncIterator[bytes]) -> bytes:
-        """Return the next chunk of a file; b"" at its end."""
-        with self._failures(source):
-            async with asyncio.timeout_at(state.deadline):
-                return await anext(chunks, b"")
-
     def _check_size(self, more: int, state: _Fetch) -> None:
         if more > state.left:
             limit = self._settings.url_bytes
@@ -648,11 +638,11 @@ class Fetcher:
                 f"The inputs by URL have more than {limit:,} bytes. Upload large files.", limit=limit
             )
 
-    @contextmanager
-    def _failures(self, source: _Input) -> Iterator[None]:
-        """Raise URL_NOT_FETCHED or INVALID_URL in place of failures of the network."""
+    async def _in_time(self, source: _Input, state: _Fetch, step: Awaitable[Value]) -> Value:
+        """Wait for a step until the deadline; raise URL_NOT_FETCHED or INVALID_URL if the network fails."""
         try:
-            yield
+            async with asyncio.timeout_at(state.deadline):
+                return await step
         except TimeoutError as error:
             raise _not_fetched(source, f"it did not arrive within {self._settings.url_seconds:g} s") from error
         except PermissionError as error:  # its message has the address, which is none of the client's business
