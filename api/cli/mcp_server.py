@@ -5,6 +5,7 @@ The SDK evaluates the annotations of the tools, so that all of their names are i
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,7 @@ import anyio.to_thread
 from mcp.server.mcpserver import Image, MCPServer
 from mcp.server.mcpserver.exceptions import ToolError
 from mcp_types import CallToolResult, TextContent, ToolAnnotations
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from api import installed_version
 from api.client import AsyncClient
@@ -72,30 +73,6 @@ Out = Annotated[
 ]
 
 
-class State(BaseModel):
-    """State of a job."""
-
-    job_id: str
-    name: str
-    status: str
-    stage: str | None
-    fraction: float | None
-    eta_s: float | None
-    queue_position: int | None
-    result: dict[str, Any] | None
-    error: str | None
-    page: str
-
-
-class JobResult(BaseModel):
-    """Result of a job."""
-
-    job_id: str
-    status: str
-    urls: dict[str, str]
-    path: str | None
-
-
 class Tools:
     """Tools of the MCP server. Expected errors become messages to the model.
 
@@ -117,18 +94,18 @@ class Tools:
 
     async def submit(
         self, scene: Scene, style: Styles, cameras: Cameras = None, photos: Photos = None, options: Options = None
-    ) -> State:
+    ) -> dict[str, Any]:
         """Queue a job that stylizes a scene. It continues on the service whatever happens here."""
         with _messages():
             files = await anyio.to_thread.run_sync(self._files, scene, style, cameras, photos)
             return self._state(await self._client.submit(**files, **_known(options)))
 
-    async def status(self, job_id: JobId) -> State:
+    async def status(self, job_id: JobId) -> dict[str, Any]:
         """Show the status and progress of a job."""
         with _messages():
             return self._state(await self._client.job(job_id))
 
-    async def result(self, job_id: JobId, out: Out = None) -> Annotated[CallToolResult, JobResult]:
+    async def result(self, job_id: JobId, out: Out = None) -> Annotated[CallToolResult, dict[str, Any]]:
         """Show the newest image of a job and the addresses of its files, and write its scene to a file."""
         with _messages():
             target = self._new_file(out, [f".{name}" for name in formats.DOWNLOADS])
@@ -142,10 +119,10 @@ class Tools:
                     file = await self._client.download(job_id, Path(folder) / "preview.jpg", preview)
                     image = Image(data=await anyio.to_thread.run_sync(file.read_bytes), format="jpeg")
         urls = {each["name"]: self._address(job_id, each["name"]) for each in artifacts}
-        result = JobResult(job_id=job_id, status=job.status, urls=urls, path=path)
-        text = TextContent(type="text", text=result.model_dump_json())
+        result = {"job_id": job_id, "status": job.status, "urls": urls, "path": path}
+        text = TextContent(type="text", text=json.dumps(result))
         content = [text] if image is None else [text, image.to_image_content()]
-        return CallToolResult(content=content, structured_content=result.model_dump(mode="json"))
+        return CallToolResult(content=content, structured_content=result)
 
     async def blend(
         self,
@@ -180,20 +157,15 @@ class Tools:
     def _address(self, job_id: str, name: str) -> str:
         return f"{self._client.url}/v1/jobs/{job_id}/artifacts/{name}"
 
-    def _state(self, job: Job) -> State:
+    def _state(self, job: Job) -> dict[str, Any]:
         progress = job.progress or {}
-        return State(
-            job_id=job.id,
-            name=job.data["name"],
-            status=job.status,
-            stage=progress.get("stage"),
-            fraction=progress.get("fraction"),
-            eta_s=progress.get("eta_s"),
-            queue_position=job.data["queue_position"],
-            result=job.data["result"],
-            error=job.error["message"] if job.error else None,
-            page=f"{self._client.url}/#/jobs/{job.id}",
-        )
+        return {
+            "job_id": job.id,
+            **{name: job.data[name] for name in ("name", "status", "queue_position", "result")},
+            **{name: progress.get(name) for name in ("stage", "fraction", "eta_s")},
+            "error": job.error["message"] if job.error else None,
+            "page": f"{self._client.url}/#/jobs/{job.id}",
+        }
 
     def _files(self, scene: str, style: list[str], cameras: str | None, photos: str | None) -> dict[str, Any]:
         """Return the files of a job as arguments of the client, after checking each of them."""

@@ -7,10 +7,10 @@ The functions check all inputs, compute, and write the outputs, but print nothin
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rich.table import Column, Table
@@ -51,16 +51,8 @@ if TYPE_CHECKING:  # it imports matplotlib, for which the other commands need no
 # --- demo ----------------------------------------------------------------------------------------------------------
 
 
-class DemoScene(NamedTuple):
-    """Files of the demo: a 3DGS PLY of SH degree 0, its views as an INRIA cameras.json, and a style image."""
-
-    ply: Path
-    cameras: Path
-    style: Path
-
-
-def build_demo(folder: Path) -> DemoScene:
-    """Write the demo's scene, cameras and style image into a folder, and create the folder.
+def build_demo(folder: Path) -> tuple[Path, Path, Path]:
+    """Create a folder, write a 3DGS PLY of SH degree 0, its views as an INRIA cameras.json, and a style image.
 
     The scene is the example of the page. It was lifted from the stereo pair Motorcycle of the Middlebury 2014 benchmark
     (Scharstein et al., "High-resolution stereo datasets with subpixel-accurate ground truth", GCPR 2014): every pixel
@@ -70,13 +62,13 @@ def build_demo(folder: Path) -> DemoScene:
         OutputError: If the folder cannot be written.
     """
     ensure_writable_folder(folder)
-    demo = DemoScene(folder / "motorcycle.ply", folder / "cameras.json", folder / "starry_night.jpg")
+    ply, cameras, style = (folder / name for name in ("motorcycle.ply", "cameras.json", "starry_night.jpg"))
     example = FOLDER / "example"
-    write_scene(demo.ply, read_scene(example / "motorcycle.sog").scene)
-    for source, target in ((example / "cameras.json", demo.cameras), (STARRY_NIGHT, demo.style)):
+    write_scene(ply, read_scene(example / "motorcycle.sog").scene)
+    for source, target in ((example / "cameras.json", cameras), (STARRY_NIGHT, style)):
         with atomic_path(target) as temporary:
             temporary.write_bytes(source.read_bytes())
-    return demo
+    return ply, cameras, style
 
 
 # --- plan ----------------------------------------------------------------------------------------------------------
@@ -104,8 +96,11 @@ def make_plan(
         check_is_not_input(out, source.cameras, "camera file")
     if sheet is not None:
         check_suffix(sheet, "a JPEG file", "views.jpg")
-        for path, description in _input_images(request):
-            check_is_not_input(sheet, path, description)
+        folders = [each.selection.path for each in request.regions if each.selection and each.selection.kind == "masks"]
+        images = [path for folder in (*folders, request.images) if folder for path in folder.rglob("*")]
+        images += [each.path for styles in (request.styles, *(r.styles for r in request.regions)) for each in styles]
+        for path in images:
+            check_is_not_input(sheet, path, "image of a style, mask or photo")
     inputs = read_inputs(request)
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
@@ -115,17 +110,6 @@ def make_plan(
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan := plan_json(job))
     return plan
-
-
-def _input_images(request: JobSpec) -> Iterator[tuple[Path, str]]:
-    """Yield the path and the description of each image that a job may read."""
-    for style in (*request.styles, *(each for region in request.regions for each in region.styles)):
-        yield style.path, "style image"
-    for region in request.regions:
-        if region.selection and region.selection.kind == "masks" and region.selection.path:
-            yield from ((path, "mask") for path in region.selection.path.rglob("*"))
-    if request.images:
-        yield from ((path, "photo") for path in request.images.rglob("*"))
 
 
 # --- check ---------------------------------------------------------------------------------------------------------

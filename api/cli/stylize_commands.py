@@ -108,13 +108,13 @@ def demo(
     except WeightsError:
         fetch("vgg16")
     with spinner("Building the scene"):
-        files = build_demo(out)
+        ply, cameras, style = build_demo(out)
     chosen = {"preset": "preview", "resolution": DEMO_RESOLUTION, "steps_sos": DEMO_STEPS, "within": DEMO_SECONDS}
-    inputs = JobArguments(str(files.ply), [str(files.style)], str(files.cameras))
+    inputs = JobArguments(str(ply), [str(style)], str(cameras))
     request = inputs.request(StylizeOptions.model_validate(chosen), out / "stylized.ply")
-    given = {"style": files.style, "cameras": files.cameras, "out": request.out, **chosen}
+    given = {"style": style, "cameras": cameras, "out": request.out, **chosen}
     options = [(f"--{name.replace('_', '-')}", str(value)) for name, value in given.items()]
-    arguments = ["stylize", str(files.ply), *itertools.chain(*options)]
+    arguments = ["stylize", str(ply), *itertools.chain(*options)]
     print_field("command", shlex.join(["sgsst", *arguments]))
     run_job(request, _resuming(arguments))
 
