@@ -21,7 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from api import installed_version
-from api.http import jobs, monitoring, sessions, shares, submission
+from api.http import access, jobs, monitoring, submission
 from api.http.context import Context, Rates
 from api.http.events import Hub
 from api.http.monitoring import Metrics, Readiness
@@ -125,8 +125,8 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     )
     app.settings = settings
     routers = [
-        *(submission.router, jobs.router, jobs.inputs_router, jobs.artifacts_router, shares.router),
-        *(submission.uploads_router, sessions.router, monitoring.router),
+        *(submission.router, jobs.router, jobs.inputs_router, jobs.artifacts_router, access.router),
+        *(submission.uploads_router, access.session_router, monitoring.router),
     ]
     for router in routers:
         app.include_router(router)

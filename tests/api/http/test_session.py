@@ -9,8 +9,8 @@ from pathlib import Path
 import httpx2
 import pytest
 
+from api.http.access import MOST_FAILURES, SECONDS_A_TRY
 from api.http.context import Rates
-from api.http.sessions import MOST_FAILURES, SECONDS_A_TRY
 from service import problems
 from service.scheduling.capacity import Machine
 from service.settings import ServiceSettings
