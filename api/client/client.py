@@ -30,7 +30,6 @@ from anyio.from_thread import start_blocking_portal
 from api.client.transport import (
     TRIES,
     ApiError,
-    Download,
     Event,
     Job,
     Progress,
@@ -261,7 +260,7 @@ class AsyncClient:
             raise OutputError(f"{target}: is a folder. Name the file to write.")
         await in_thread(ensure_writable_folder, target.parent)
         query = f"?format={format}" if format and format != PLY.name else ""
-        await self._transport.fetch(Download(f"{_job_path(job_id)}/artifacts/{quote(name)}{query}", target, progress))
+        await self._transport.fetch(f"{_job_path(job_id)}/artifacts/{quote(name)}{query}", target, progress)
         return target
 
     async def blend(

@@ -39,93 +39,6 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 T = TypeVar("T")
 
 
-class Download:
-    """Protocol of one download to a target path, for `Transport.fetch`.
-
-    A partial file is resumed, also that of an earlier process: its name has the SHA-256 of the complete file, by which
-    that is checked.
-
-    Attributes:
-        path: Path of the file on the service.
-    """
-
-    def __init__(self, path: str, target: Path, progress: Progress) -> None:
-        self.path = path
-        self._target, self._progress = target, progress
-        self._expected = ""
-        self._done = self._size = 0
-
-    @property
-    def _part(self) -> Path:
-        return temporary_path(self._target, self._expected)
-
-    def headers(self) -> dict[str, str]:
-        """Return headers that resume the partial file, if there is one, and that keep proxies from compressing."""
-        for path in self._target.parent.glob(temporary_path(self._target, "*").name):
-            if (stated := _SHA256.search(path.name)) and path.is_file() and not path.is_symlink():
-                self._expected, self._done = stated[0], path.stat().st_size
-                tag = f'"{self._expected}"'
-                return {"Accept-Encoding": "identity", "Range": f"bytes={self._done}-", "If-Range": tag}
-        return {"Accept-Encoding": "identity"}
-
-    def begin(self, response: httpx2.Response) -> bool:
-        """Process the headers of a successful response, or of status 416, which means that all bytes were received.
-
-        Returns:
-            Whether the response's body must be written.
-
-        Raises:
-            ApiError: If the response does not state the SHA-256 of the file.
-            OutputError: If the disk is full.
-        """
-        if response.status_code == httpx2.codes.RANGE_NOT_SATISFIABLE:
-            return False
-        stated = _SHA256.search(response.headers.get("etag", ""))
-        if stated is None:
-            raise ApiError(
-                f"{response.url}: has no SHA-256 as its ETag, so the file cannot be checked. Check the address, and "
-                "which headers a proxy removes."
-            )
-        if response.status_code != httpx2.codes.PARTIAL_CONTENT:
-            self.discard()
-            self._done = 0
-            self._expected = stated[0]
-            with disk_errors(self._target, self._part):
-                self._part.open("xb").close()
-        self._size = self._done + int(response.headers.get("content-length", 0))
-        return True
-
-    def write(self, block: bytes) -> None:
-        """Append a block to the partial file.
-
-        Raises:
-            OutputError: If the disk is full.
-        """
-        with disk_errors(self._target, self._part, self._size), self._part.open("ab") as file:
-            file.write(block)
-        self._done += len(block)
-
-    def report(self) -> None:
-        """Report the progress."""
-        self._progress(self._done, self._size)
-
-    def finish(self) -> None:
-        """Check the whole file, then rename it to its target.
-
-        Raises:
-            ApiError: If the SHA-256 differs from the service's. The partial file is then deleted.
-            OutputError: If another program holds the target open.
-        """
-        if file_digest(self._part) != self._expected:
-            self.discard()
-            raise ApiError(f"{self.path}: the download was damaged in transit. Try again.", 460)
-        replace(self._part, self._target)
-
-    def discard(self) -> None:
-        """Delete the partial file."""
-        self._part.unlink(missing_ok=True)
-
-
 class Transport:
     """Connections to a service.
 
@@ -217,33 +130,37 @@ class Transport:
             raise ApiError("The connection ended before the result arrived. Try again.", 502)
         return result
 
-    async def fetch(self, download: Download) -> None:
-        """Download a file; a broken download is resumed.
+    async def fetch(self, path: str, target: Path, progress: Progress) -> None:
+        """Download a file, and check its SHA-256. A broken download is resumed, also that of an earlier process.
+
+        The name of the partial file has the SHA-256 of the complete one.
 
         Raises:
-            RequestError, ApiError: As for `call`.
-            OutputError: If the disk is full. Nothing of the file remains.
+            RequestError, ApiError: As for `call`, or if the response does not state the SHA-256, or has another one.
+            OutputError: If the disk is full, and nothing of the file remains; or another program holds the target open.
         """
 
         async def once() -> None:
-            headers = await in_thread(download.headers)
-            async with self.http.stream("GET", download.path, headers=headers) as response:
+            digest, done = await in_thread(_partial_file, target)
+            headers = {"Accept-Encoding": "identity"}  # keeps proxies from compressing
+            if digest:
+                headers |= {"Range": f"bytes={done}-", "If-Range": f'"{digest}"'}
+            async with self.http.stream("GET", path, headers=headers) as response:
                 self.reached = True
-                # Status 416 means that all bytes were received before.
-                if response.is_error and response.status_code != httpx2.codes.RANGE_NOT_SATISFIABLE:
-                    await response.aread()
-                    checked(response)
-                if await in_thread(download.begin, response):
+                if response.status_code != httpx2.codes.RANGE_NOT_SATISFIABLE:  # else all bytes were received before
+                    if response.is_error:
+                        await response.aread()
+                        checked(response)
+                    if response.status_code != httpx2.codes.PARTIAL_CONTENT:
+                        digest, done = await in_thread(_start_file, target, digest, response), 0
+                    size = done + int(response.headers.get("content-length", 0))
                     async for block in response.aiter_bytes(BLOCK):
-                        await in_thread(download.write, block)
-                        download.report()
-            await in_thread(download.finish)
+                        await in_thread(_append, target, digest, block, size)
+                        done += len(block)
+                        progress(done, size)
+            await in_thread(_finish_file, path, target, digest)
 
-        try:
-            await self._retry(once, reading=True)
-        except OutputError:
-            await in_thread(download.discard)
-            raise
+        await self._retry(once, reading=True)
 
     def gives_up(self, error: Exception) -> bool:
         """Return whether a read error means that there is no service, rather than that it is restarting."""
@@ -266,6 +183,49 @@ class Transport:
             return await self._retrying(may_pass, once)
         except httpx2.TransportError as error:
             raise self.unreachable(error) from None
+
+
+def _partial_file(target: Path) -> tuple[str, int]:
+    """Return the SHA-256 in the name of a file's partial download, and its size; an empty text if there is none."""
+    for path in target.parent.glob(temporary_path(target, "*").name):
+        if (stated := _SHA256.search(path.name)) and path.is_file() and not path.is_symlink():
+            return stated[0], path.stat().st_size
+    return "", 0
+
+
+def _start_file(target: Path, old: str, response: httpx2.Response) -> str:
+    """Create the partial file of a download in place of an older one, and return the SHA-256 of the whole file."""
+    stated = _SHA256.search(response.headers.get("etag", ""))
+    if stated is None:
+        raise ApiError(
+            f"{response.url}: has no SHA-256 as its ETag, so the file cannot be checked. Check the address, and which "
+            "headers a proxy removes."
+        )
+    temporary_path(target, old).unlink(missing_ok=True)
+    part = temporary_path(target, stated[0])
+    with disk_errors(target, part):
+        part.open("xb").close()
+    return stated[0]
+
+
+def _append(target: Path, digest: str, block: bytes, size: int) -> None:
+    """Append a block to a partial file, which is deleted if the disk is full."""
+    part = temporary_path(target, digest)
+    try:
+        with disk_errors(target, part, size), part.open("ab") as file:
+            file.write(block)
+    except OutputError:
+        part.unlink()
+        raise
+
+
+def _finish_file(path: str, target: Path, digest: str) -> None:
+    """Check a whole file, then rename it to its target; a damaged one is deleted."""
+    part = temporary_path(target, digest)
+    if file_digest(part) != digest:
+        part.unlink()
+        raise ApiError(f"{path}: the download was damaged in transit. Try again.", 460)
+    replace(part, target)
 
 
 def _is_address(url: str) -> bool:
