@@ -11,6 +11,7 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
+import json
 import os
 import re
 import secrets
@@ -204,7 +205,7 @@ class AsyncClient:
                         return
                     async for sent in source:
                         if sent.data:  # messages without data only keep the connection alive
-                            event = Event.of(sent)
+                            event = Event(int(sent.id or 0), sent.event, json.loads(sent.data))
                             after, failures = event.id, 0
                             yield event
             except httpx2.TransportError as error:
@@ -636,18 +637,11 @@ def camera_files(path: Path) -> list[Path]:
     _check_exists(path)
     cameras = find_cameras(path, issue_warning)
     if cameras.is_dir():
-        return _model_files(cameras) or [path]
+        suffix = ".bin" if (cameras / "cameras.bin").is_file() else ".txt"
+        files = (cameras / f"{name}{suffix}" for name in ("cameras", "images"))  # nothing else of a model is read
+        return [file for file in files if file.is_file()] or [path]
     companion = cameras.with_name("dataparser_transforms.json")
     return [cameras, companion] if companion.is_file() and companion != cameras else [cameras]
-
-
-def _model_files(folder: Path) -> list[Path]:
-    """Return the files of a COLMAP model; empty if the folder holds none."""
-    for suffix in (".bin", ".txt"):
-        if (folder / f"cameras{suffix}").is_file():
-            names = ("cameras", "images", "points3D", "rigs", "frames")
-            return [file for name in names if (file := folder / f"{name}{suffix}").is_file()]
-    return []
 
 
 def _check_exists(path: Path) -> None:

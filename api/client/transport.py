@@ -335,11 +335,6 @@ class Event:
     kind: str
     data: Mapping[str, Any]
 
-    @staticmethod
-    def of(event: httpx2.ServerSentEvent) -> Event:
-        """Return the event from the service's stream."""
-        return Event(int(event.id or 0), event.event, json.loads(event.data))
-
 
 def checked(response: httpx2.Response) -> httpx2.Response:
     """Return the response if it is not an error. Its body must have been read.

@@ -26,9 +26,9 @@ from api.http.context import Context, Rates
 from api.http.events import Hub
 from api.http.monitoring import Metrics, Readiness
 from api.http.problems import (
+    HANDLERS,
     METHODS,
     Problem,
-    add_handlers,
     complete,
     from_service,
     logged_path,
@@ -122,6 +122,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
         docs_url=None,  # FastAPI's own page loads its script from a CDN
         redoc_url=None,
+        exception_handlers=HANDLERS,
     )
     app.settings = settings
     routers = [
@@ -131,7 +132,6 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     for router in routers:
         app.include_router(router)
     add_static(app)
-    add_handlers(app)
     app.add_middleware(Deadlines, seconds=settings.answer_seconds)
 
     plain = app.openapi

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from http import HTTPStatus
 from typing import Any, TypeVar
 
-from fastapi import FastAPI, Request
+from fastapi import Request
 from fastapi.dependencies.models import Dependant
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -87,17 +87,6 @@ def _response(status: int, code: str, detail: str, headers: dict[str, str], **ex
     return JSONResponse(body.model_dump(mode="json"), status, headers, media_type=MEDIA_TYPE)
 
 
-def add_handlers(app: FastAPI) -> None:
-    """Register handlers that convert every error of the app to a problem document."""
-    app.add_exception_handler(ServiceError, _expected)
-    app.add_exception_handler(InvalidInputError, _expected)
-    app.add_exception_handler(RequestValidationError, _invalid_request)
-    app.add_exception_handler(ValidationError, _invalid_request)
-    app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(OSError, _system_error)
-    app.add_exception_handler(Exception, _unexpected)
-
-
 def from_service(error: ServiceError) -> JSONResponse:
     """Return the problem document of a service error."""
     headers = dict(error.headers)
@@ -168,6 +157,18 @@ async def _unexpected(request: Request, error: Exception) -> JSONResponse:
     extra = {"request_id": request_id}
     _log.exception("%s %s failed unexpectedly", request.method, logged_path(scope), exc_info=error, extra=extra)
     return from_service(problems.INTERNAL(request_id=request_id))
+
+
+#: Functions that convert every error of the app to a problem document.
+HANDLERS: dict[Any, Any] = {
+    ServiceError: _expected,
+    InvalidInputError: _expected,
+    RequestValidationError: _invalid_request,
+    ValidationError: _invalid_request,
+    HTTPException: _http_error,
+    OSError: _system_error,
+    Exception: _unexpected,
+}
 
 
 def route_of(scope: Scope) -> str:
