@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
-from api.cli.console import error_console, out_console, print_field, spinner
+from api.cli.console import error_console, out_console, print_field
 from api.cli.options import (
     CamerasOption,
     JobArguments,
@@ -101,7 +101,7 @@ def check(
     from api.cli.scene_tools import look_for_extremes
 
     source = source_of(scene, cameras, options)
-    with spinner("Checking the scene and every view"):
+    with error_console.status("Checking the scene and every view"):
         findings = look_for_extremes(source, style)
     if not findings:
         out_console.print("No extreme values were found.")
@@ -296,7 +296,7 @@ def view(
     if len({*names}) < len(names) or len(names) > MOST_VIEWPOINTS:
         raise SettingsError(f"--views {views}: must be at most {MOST_VIEWPOINTS} names, each of them once.")
     source = SceneRequest.of(scene, cameras, options)
-    with spinner("Compressing the scene"):
+    with error_console.status("Compressing the scene"):
         file, _ = read_requested(source)
         before = None if original is None else read_requested(source.model_copy(update={"scene": original}))[0]
         capture = None if cameras is None else read_capture(source, file.scene)
@@ -507,7 +507,7 @@ def make(
     source = source_of(named(variants[0])[1], cameras, options)
     if options.views is None and options.orbit is None:
         source = source.model_copy(update={"views": _VIEWS})
-    with spinner("Rendering the views"):
+    with error_console.status("Rendering the views"):
         make_study(variants, source, style, chosen.settings().background, out)
     print_field("page", out)
     print_field("key", key_path(out))

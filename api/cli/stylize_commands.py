@@ -29,7 +29,6 @@ from api.cli.console import (
     loss_text,
     out_console,
     print_field,
-    spinner,
     transfer_bar,
 )
 from api.cli.machine_commands import fetch
@@ -107,7 +106,7 @@ def demo(
         load_network_weights("auto")
     except WeightsError:
         fetch("vgg16")
-    with spinner("Building the scene"):
+    with error_console.status("Building the scene"):
         ply, cameras, style = build_demo(out)
     chosen = {"preset": "preview", "resolution": DEMO_RESOLUTION, "steps_sos": DEMO_STEPS, "within": DEMO_SECONDS}
     inputs = JobArguments(str(ply), [str(style)], str(cameras))

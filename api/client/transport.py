@@ -103,27 +103,21 @@ class Transport:
         json_text(options.get("json"))
         result: dict[str, Any] = {}
 
-        def take(event: httpx2.ServerSentEvent) -> None:
-            if not event.data:
-                return
-            data = json.loads(event.data)
-            if event.event == step:
-                if data["total"]:  # stages of unknown length have no steps
-                    progress(data["step"], data["total"])
-            elif event.event == "problem":
-                raise refusal(data["detail"], data["status"], data)
-            else:
-                result.update(data)
-
         async def once() -> None:
             async with self.http.sse(path, method="POST", **options) as source:
                 self.reached = True
-                if source.response.headers.get("content-type", "").startswith("text/event-stream"):
-                    async for event in source:
-                        take(event)
-                else:
+                if not source.response.headers.get("content-type", "").startswith("text/event-stream"):
                     await source.response.aread()
                     result.update(checked(source.response).json())
+                    return
+                async for event in source:
+                    data = json.loads(event.data or "{}")  # messages without data only keep the connection alive
+                    if event.event == "problem":
+                        raise refusal(data["detail"], data["status"], data)
+                    if event.event != step:
+                        result.update(data)
+                    elif data["total"]:  # stages of unknown length have no steps
+                        progress(data["step"], data["total"])
 
         await self._retry(once)
         if not result:  # the service was stopped, or a proxy cut the response off
