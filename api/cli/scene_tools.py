@@ -314,8 +314,6 @@ def _read_variants(request: VariantsRequest) -> tuple[SceneFile, dict[str, Any],
 def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
     """Run the variants, and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
 
-    The JSON file is written after each evaluation, so that an interrupted run leaves what it has measured.
-
     Args:
         progress: Callback that receives a curve after each of its evaluations.
 
@@ -325,18 +323,8 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
     from sgsst_core.bench.variants import as_dict, error_time, write_plot
 
     file, arguments, described = _read_variants(request)
-    measured: dict[str, Curve] = {}
-
-    def write(curves: Sequence[Curve]) -> None:
-        write_json(request.out / "error_time.json", {**described, **as_dict(curves)})
-
-    def evaluated(curve: Curve) -> None:
-        measured[curve.variant.name] = curve
-        write(list(measured.values()))
-        progress(curve)
-
-    curves = error_time(**arguments, progress=evaluated)
-    write(curves)
+    curves = error_time(**arguments, progress=progress)
+    write_json(request.out / "error_time.json", {**described, **as_dict(curves)})
     write_plot(request.out / "error_time.png", curves, request.title)
     for curve in curves:
         if curve.sh_dc is not None:

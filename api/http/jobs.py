@@ -9,7 +9,7 @@ import asyncio
 import hashlib
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import PurePosixPath
 from typing import Annotated, Any
@@ -199,12 +199,8 @@ async def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> N
     """Delete a job that has ended, with its results."""
     check_id(job_id)
     unused = await asyncio.to_thread(context.store.jobs.delete, job_id, caller.owner)
-    await context.receipts.remove(caller.owner, partial(_remove_files, context, job_id, unused))
-
-
-def _remove_files(context: Context, job_id: str, unused: Sequence[str]) -> None:
-    context.artifacts.objects.remove_below(job_id)
-    context.blobs.remove(unused)
+    results, inputs = partial(context.artifacts.objects.remove_below, job_id), partial(context.blobs.remove, unused)
+    await context.receipts.remove(caller.owner, results, inputs)
 
 
 def find(context: Context, caller: Caller, job_id: str) -> JobRow:

@@ -75,10 +75,11 @@ class Receipts:
         if unused:
             await self.remove(owner, partial(self._blobs.remove, unused))
 
-    async def remove(self, owner: str, files: Callable[[], None]) -> None:
+    async def remove(self, owner: str, *removals: Callable[[], None]) -> None:
         """Remove files that no database row refers to any longer; housekeeping removes those that remain."""
         try:
-            await self._threads.clean_up(self._threads.run(owner, files))
+            for remove in removals:
+                await self._threads.clean_up(self._threads.run(owner, remove))
         except (StoreError, OSError) as error:
             _log.warning("unused files not deleted yet: %s", error.__cause__ or error)
 

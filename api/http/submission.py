@@ -332,7 +332,8 @@ async def delete_upload(upload_id: UploadId, context: ContextDep, caller: Caller
     """Cancel an upload, or delete a finished one. Jobs that use it keep their file."""
     await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     unused = await asyncio.to_thread(context.store.inputs.delete_upload, upload_id, caller.owner)
-    await context.receipts.remove(caller.owner, partial(_remove_files, context, upload_id, unused))
+    part, blobs = partial(context.blobs.discard_upload, upload_id), partial(context.blobs.remove, unused)
+    await context.receipts.remove(caller.owner, part, blobs)
     return Response(status_code=204, headers=_HEADERS)
 
 
@@ -427,11 +428,6 @@ def _parse_checksum(header: str) -> tuple[str, bytes]:
         return name, base64.b64decode(value, validate=True)
     except ValueError as error:  # raised for non-ASCII characters too
         raise problems.MALFORMED_BODY("Upload-Checksum: the digest is not base64.") from error
-
-
-def _remove_files(context: Context, upload_id: str, unused: Sequence[str]) -> None:
-    context.blobs.discard_upload(upload_id)
-    context.blobs.remove(unused)
 
 
 def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
