@@ -144,11 +144,9 @@ def run_service(settings: ServiceSettings, announce: Callable[[str], None]) -> N
         SettingsError: If the address is in use, other machines can reach the service and no API key exists, or no
             feature network is installed.
     """
-    from service.settings import keep_private, missing_extras
-    from service.store import open_store
+    from service.settings import missing_extras
 
-    keep_private(settings)
-    store = open_store(settings)
+    store = _open_store(settings)
     if settings.keys_required and not any(key.revoked_at is None for key in store.keys.all()):
         raise SettingsError(
             f"{settings.host} can be reached from other machines, but there is no API key. Create one with "
@@ -299,7 +297,7 @@ def create_key(
     from service.store.keys import Quotas
 
     quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
-    row, text = _open_store(data).keys.create(name, priority, quotas, operator=operator)
+    row, text = _open_store(_service_settings(data)).keys.create(name, priority, quotas, operator=operator)
     if as_json:
         out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
         return
@@ -310,7 +308,7 @@ def create_key(
 @keys_app.command("list")
 def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
     """List API keys, without the keys themselves."""
-    rows = _open_store(data).keys.all()
+    rows = _open_store(_service_settings(data)).keys.all()
     if as_json:
         shown = [
             {name: getattr(row, name) for name in ("id", "name", "priority", "operator")}
@@ -334,7 +332,7 @@ def revoke_key(
     data: DataOption = None,
 ) -> None:
     """Revoke an API key."""
-    row = _open_store(data).keys.revoke(key_id)
+    row = _open_store(_service_settings(data)).keys.revoke(key_id)
     error_console.print(f"Revoked key {row.id} of {row.name!r}.")
 
 
@@ -374,16 +372,16 @@ def _open_existing_store(data: Path | None) -> Store:
     """
     from sqlalchemy.engine import make_url
 
-    url = make_url(_service_settings(data).database_url)
+    settings = _service_settings(data)
+    url = make_url(settings.database_url)
     if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():  # which opening would create
         raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
-    return _open_store(data)
+    return _open_store(settings)
 
 
-def _open_store(data: Path | None) -> Store:
+def _open_store(settings: ServiceSettings) -> Store:
     from service.settings import keep_private
     from service.store import open_store
 
-    settings = _service_settings(data)
     keep_private(settings)
     return open_store(settings)

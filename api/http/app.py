@@ -23,7 +23,7 @@ from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 from api import installed_version
 from api.http import access, jobs, monitoring, submission
 from api.http.context import Context, Rates
-from api.http.events import Hub
+from api.http.jobs import Hub
 from api.http.monitoring import Metrics, Readiness
 from api.http.problems import (
     HANDLERS,

@@ -31,7 +31,7 @@ from service.store.keys import NO_QUOTAS, Quotas
 from service.store.tables import KeyRow
 
 if TYPE_CHECKING:
-    from api.http.events import Hub
+    from api.http.jobs import Hub
     from api.http.monitoring import Metrics, Readiness
     from api.http.receiving import Fetcher, Receipts
     from service.deadlines import FileThreads, OwnerLimit

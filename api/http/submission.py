@@ -24,8 +24,7 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, Digits, is_id
-from api.http.events import DRY_RUN, answer_work
-from api.http.jobs import FOLLOWING_OPERATIONS, find, parse_input
+from api.http.jobs import DRY_RUN, FOLLOWING_OPERATIONS, answer_work, find, parse_input
 from api.http.problems import headers, links, raises
 from api.http.receiving import (
     MAX_TEXT,

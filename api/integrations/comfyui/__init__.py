@@ -15,7 +15,7 @@ from comfy_api.latest import IO, ComfyExtension, Types
 from comfy_extras.nodes_gaussian_splat import File3DToSplat, SplatToFile3D
 from PIL import Image
 
-from .sgsst_rest import Service, fraction
+from .sgsst_rest import Service, fraction, orbit_options
 
 _CATEGORY = "3d/splat"
 #: Steps of the progress bar.
@@ -102,9 +102,7 @@ class Stylize(IO.ComfyNode):
         """Run the job; return the stylized splat, an image of it, and the job's id."""
         count = _real_count(splat)
         connection = Service(service)
-        options: dict[str, Any] = {"preset": preset, "orbit": views or "auto", "up": up}
-        if minutes:
-            options["within"] = 60 * minutes
+        options = orbit_options(preset, views, up, minutes)
         with tempfile.TemporaryDirectory() as folder:
             scene, style_file, out = (Path(folder) / name for name in ("splat.ply", "style.png", "stylized.ply"))
             SplatToFile3D.execute(splat, "ply")[0].save_to(str(scene))

@@ -13,7 +13,7 @@ import numpy as np
 
 import lichtfeld as lf
 
-from .sgsst_rest import BackgroundJob, Service, read_colors, write_splat
+from .sgsst_rest import BackgroundJob, Service, orbit_options, read_colors, write_splat
 
 _PRESETS = ["preview", "standard", "paper"]
 _UP = ["auto", "-y", "y", "-z", "z", "-x", "x"]
@@ -172,10 +172,7 @@ class SgsstPanel(lf.ui.Panel):
         style = Path(self._style)
         if not style.is_file():
             raise ValueError(f"There is no painting {self._style!r}. Choose an image file.")
-        options: dict[str, Any] = {"preset": _PRESETS[self._preset], "orbit": self._views or "auto"}
-        options["up"] = _UP[self._up]
-        if self._minutes > 0:
-            options["within"] = 60 * self._minutes
+        options = orbit_options(_PRESETS[self._preset], self._views, _UP[self._up], self._minutes)
         return Running(lf.get_selected_node_name(), style, Service(self._service), options)
 
     def _draw_progress(self, ui: Any, running: Running) -> None:
