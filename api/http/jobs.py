@@ -156,7 +156,8 @@ class Hub:
     async def _events_after(self, job_id: str, after: int) -> list[EventRow]:
         try:
             return await asyncio.to_thread(self._store.jobs.events, job_id, after)
-        except DatabaseUnavailableError:  # The stream waits until the database is back.
+        except DatabaseUnavailableError:  # The stream waits until the database is back, and the next poll wakes it.
+            self._watched[job_id].newest = 0
             return []
 
     async def _poll(self) -> None:
