@@ -15,11 +15,11 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import PurePosixPath
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
-from pydantic import BaseModel
+from pydantic import AfterValidator, BaseModel
 from pydantic_core import to_jsonable_python
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, Digits, is_id
@@ -236,11 +236,8 @@ VIDEO = _work_documentation(
 )
 
 
-class Work(Protocol):
-    """Function that makes a result and reports its progress."""
-
-    def __call__(self, show: Any) -> Coroutine[Any, Any, BaseModel]:
-        """Return the result; call `show` with the data of each progress event."""
+#: Function that makes a result, and calls its argument with the data of each progress event.
+Work = Callable[[Any], Coroutine[Any, Any, BaseModel]]
 
 
 async def answer_work(
@@ -335,7 +332,15 @@ def _encoded(kind: str, data: Mapping[str, Any]) -> bytes:
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
-JobId = Annotated[str, Path(description="ID of a job.", examples=[JOB_ID])]
+
+def _check_id(job_id: str) -> str:
+    """Return the id of a job; raise NoJobError if a text cannot be one, which needs no query."""
+    if not is_id(job_id):
+        raise problems.NO_JOB(job_id=job_id[:60])
+    return job_id
+
+
+JobId = Annotated[str, AfterValidator(_check_id), Path(description="ID of a job.", examples=[JOB_ID])]
 #: Headers of a response that shows a job.
 _SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
 #: Operations that a client may call next on a job.
@@ -395,7 +400,6 @@ async def list_jobs(
 )
 def get_job(job_id: JobId, context: ContextDep, caller: CallerDep, if_none_match: IfNoneMatch = None) -> Response:
     """Get a job. `Retry-After` says when to poll again; `If-None-Match` avoids sending an unchanged body."""
-    check_id(job_id)
     return _job_response(context, caller, job_id, if_none_match)
 
 
@@ -438,7 +442,6 @@ def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> Progr
 )
 def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """End a running job after its current step and keep its result so far. Until then, its status is `finishing`."""
-    check_id(job_id)
     context.store.jobs.finish(job_id, caller.owner)
     return _job_response(context, caller, job_id)
 
@@ -450,7 +453,6 @@ def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
 )
 def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Cancel a job. A waiting job is canceled at once, a running one within seconds (`canceling` until then)."""
-    check_id(job_id)
     context.store.jobs.cancel(job_id, caller.owner)
     return _job_response(context, caller, job_id)
 
@@ -472,7 +474,6 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
 @router.delete("/{job_id}", status_code=204, responses={204: {"description": "The job and its results are deleted."}})
 async def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
     """Delete a job that has ended, with its results."""
-    check_id(job_id)
     unused = await asyncio.to_thread(context.store.jobs.delete, job_id, caller.owner)
     results, inputs = partial(context.artifacts.objects.remove_below, job_id), partial(context.blobs.remove, unused)
     await context.receipts.remove(caller.owner, results, inputs)
@@ -484,14 +485,7 @@ def find(context: Context, caller: Caller, job_id: str) -> JobRow:
     Raises:
         NoJobError: If there is no such job, or it belongs to another caller.
     """
-    check_id(job_id)
     return context.store.jobs.get(job_id, caller.owner)
-
-
-def check_id(job_id: str) -> None:
-    """Raise NoJobError if a text cannot be a job's id."""
-    if not is_id(job_id):
-        raise problems.NO_JOB(job_id=job_id[:60])
 
 
 def _job_response(

@@ -95,14 +95,12 @@ def from_service(error: ServiceError) -> JSONResponse:
     return _response(error.status, error.code, str(error), headers, **error.extra)
 
 
-async def _expected(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, ServiceError | InvalidInputError)
+async def _expected(request: Request, error: ServiceError | InvalidInputError) -> JSONResponse:
     known = error if isinstance(error, ServiceError) else problems.INVALID_INPUT(str(error), code=error.code)
     return from_service(known)
 
 
-async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError | ValidationError)
+async def _invalid_request(request: Request, error: RequestValidationError | ValidationError) -> JSONResponse:
     outer = int(
         isinstance(error, RequestValidationError)
     )  # its locations start with a part of the request: query, body
@@ -122,8 +120,7 @@ def _unknown(at: str) -> str:
     return unknown_text(at.rpartition(".")[2], {*JobParameters.model_fields, *RegionOptions.model_fields})
 
 
-async def _http_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, HTTPException)
+async def _http_error(request: Request, error: HTTPException) -> JSONResponse:
     path = request.scope["path"][:_SHOWN]
     if error.status_code == 404:
         return from_service(problems.NOT_FOUND(f"There is nothing at {path!r}. {address('/docs')} lists all paths."))
@@ -142,8 +139,7 @@ def routed_methods(scope: Scope) -> list[str]:
     return [method for method in METHODS if any(route.matches(scopes[method])[0] is Match.FULL for route in routes)]
 
 
-async def _system_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, OSError)
+async def _system_error(request: Request, error: OSError) -> JSONResponse:
     if is_full(error):
         return from_service(problems.NO_SPACE())
     if error.errno not in (errno.EMFILE, errno.ENFILE):
