@@ -102,8 +102,6 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
         # Most of these threads wait; the default executor has few of them on machines with few processors.
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
-        context.hub.start()
-        context.receipts.start()
         with suppress(DamagedWeightsError):  # the error is logged, and /readyz reports it
             await asyncio.to_thread(check_weights)
         yield

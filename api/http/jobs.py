@@ -94,13 +94,9 @@ class Hub:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._watched: dict[str, _Watched] = {}
-        self._task: asyncio.Task[None] | None = None
         self._closing = False
         #: Work that clients wait for, which is canceled when the service stops.
         self.working: set[asyncio.Task[Any]] = set()
-
-    def start(self) -> None:
-        """Start polling."""
         self._task = asyncio.create_task(self._poll())
 
     async def close(self) -> None:
@@ -110,8 +106,7 @@ class Hub:
             task.cancel()
         for watched in self._watched.values():
             watched.changed.set()
-        if self._task is not None:
-            self._task.cancel()
+        self._task.cancel()
 
     async def resumed(self, job_id: str, after: int) -> int | None:
         """Return the id of the event after which to continue a stream whose last event had the id `after`.

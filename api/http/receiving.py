@@ -54,16 +54,11 @@ class Receipts:
     def __init__(self, inputs: InputRows, blobs: Blobs, threads: FileThreads) -> None:
         self.inputs, self._blobs, self._threads = inputs, blobs, threads
         self.active: set[str] = set()
-        self._renewing: asyncio.Task[None] | None = None
-
-    def start(self) -> None:
-        """Start the renewal task."""
         self._renewing = asyncio.create_task(self._renew())
 
     def close(self) -> None:
         """Stop the renewal task."""
-        if self._renewing is not None:
-            self._renewing.cancel()
+        self._renewing.cancel()
 
     async def end(self, owner: str, receipt: str) -> None:
         """Release the charge of a receipt, and delete the request's files unless other jobs or uploads use them."""
