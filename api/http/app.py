@@ -14,7 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
-import anyio
 import anyio.to_thread
 from fastapi import FastAPI
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -180,14 +179,11 @@ class Observed:
         request: Scope = {**scope, "request_id": request_id}  # other middleware changes the copy, not the server's
         status = 0
 
-        def note(new_status: int) -> None:
-            nonlocal status
-            status = new_status
-            self._note(scope["method"], request, status, time.perf_counter() - started)
-
         async def observed(message: Message) -> None:
+            nonlocal status
             if message["type"] == "http.response.start":
-                note(message["status"])
+                status = message["status"]
+                self._note(scope["method"], request, status, time.perf_counter() - started)
                 message = {**message, "headers": [*message["headers"], (b"x-request-id", request_id.encode())]}
             await send(message)
 
@@ -198,7 +194,7 @@ class Observed:
                 await from_service(problems.STOPPING())(request, receive, observed)
         except BaseException:
             if status < 500:
-                note(500)
+                self._note(scope["method"], request, 500, time.perf_counter() - started)
             raise
 
     def _note(self, method: str, request: Scope, status: int, seconds: float) -> None:

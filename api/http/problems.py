@@ -104,20 +104,18 @@ async def _invalid_request(request: Request, error: RequestValidationError | Val
     outer = int(
         isinstance(error, RequestValidationError)
     )  # its locations start with a part of the request: query, body
+    known = {*JobParameters.model_fields, *RegionOptions.model_fields}
     errors = [
         {
             "at": (at := ".".join(str(part) for part in entry["loc"][outer:])[:_SHOWN]),
-            "message": _unknown(at) if entry["type"] == "extra_forbidden" else reason(entry),
+            "message": unknown_text(at.rpartition(".")[2], known)
+            if entry["type"] == "extra_forbidden"
+            else reason(entry),
         }
         for entry in merged(error.errors())[:20]
     ]
     first = errors[0] if errors else {"at": "", "message": "invalid"}
     return from_service(problems.INVALID_REQUEST(f"{first['at'] or 'body'}: {first['message']}", errors=errors))
-
-
-def _unknown(at: str) -> str:
-    """Return the message for an unknown parameter of a job or region."""
-    return unknown_text(at.rpartition(".")[2], {*JobParameters.model_fields, *RegionOptions.model_fields})
 
 
 async def _http_error(request: Request, error: HTTPException) -> JSONResponse:

@@ -96,12 +96,13 @@ class Receipt:
 
     Attributes:
         id: Id in the database; None until something is charged.
+        received: Number of received bytes.
     """
 
     def __init__(self, receipts: Receipts, owner: str, quotas: Quotas) -> None:
         self.id: str | None = None
         self._receipts, self.owner, self._quotas = receipts, owner, quotas
-        self._charged = self._received = 0
+        self._charged = self.received = 0
 
     def charge(self, declared: int) -> None:
         """Charge bytes that the request, or a server it names, declares; 0 if it declares none.
@@ -122,11 +123,11 @@ class Receipt:
         Raises:
             QUOTA_EXCEEDED: If the owner would exceed the quota.
         """
-        self._received += size
-        more = self._received - self._charged
+        self.received += size
+        more = self.received - self._charged
         if more > 0 and self.id is not None:
             self._receipts.inputs.grow_receipt(self.id, more, self.owner, self._quotas)
-            self._charged = self._received
+            self._charged = self.received
 
     def hand_over(self) -> None:
         """Record that a job has taken over the files and their charge."""
@@ -505,26 +506,21 @@ def file_name(url: str) -> str:
     return PurePosixPath(httpx2.URL(url).path).name
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Fetch:
-    """State of fetching the inputs of one request.
+    """Input by URL that is being fetched.
 
     Attributes:
+        url: URL as the client wrote it.
         deadline: Time of the event loop at which the request gives up.
-        left: Bytes that may still be fetched.
+        most: Limit of the receipt's received bytes.
     """
-
-    receipt: Receipt
-    deadline: float
-    left: int
-
-
-@dataclass(frozen=True)
-class _Input:
-    """Input by URL: the URL as the client wrote it, and the role of the file."""
 
     url: str
     role: str
+    receipt: Receipt
+    deadline: float
+    most: int
 
 
 class Fetcher:
@@ -547,7 +543,7 @@ class Fetcher:
         """
         urls = {text: role for _, role, text in references if is_url(text)}
         for url, role in urls.items():
-            self._parse(url, _Input(url, role))
+            self._parse(url, url, role)
         return urls
 
     async def fetch(self, urls: dict[str, str], receipt: Receipt) -> dict[str, str]:
@@ -566,52 +562,51 @@ class Fetcher:
             raise problems.BUSY("Too many inputs by URL are being fetched. Try again later.")
         async with limit:
             deadline = asyncio.get_running_loop().time() + self._settings.url_seconds
-            state = _Fetch(receipt, deadline, self._settings.url_bytes)
+            most = receipt.received + self._settings.url_bytes
             await asyncio.to_thread(receipt.charge, 0)
-            return {url: await self._fetch(_Input(url, role), state) for url, role in urls.items()}
+            return {url: await self._fetch(_Fetch(url, role, receipt, deadline, most)) for url, role in urls.items()}
 
-    def _parse(self, url: str, source: _Input) -> httpx2.URL:
-        """Parse the URL of an input, or of a redirect from it, and check that its host is allowed."""
+    def _parse(self, url: str, given: str, role: str) -> httpx2.URL:
+        """Parse the given URL of an input, or of a redirect from it, and check that its host is allowed."""
         if not self._allowed:
-            raise problems.URLS_OFF(input=source.role)
+            raise problems.URLS_OFF(input=role)
         try:
             parsed = parse_url(url)
         except ValueError as error:
-            raise _invalid(source, error) from error
+            raise _invalid(given, role, error) from error
         if origin(parsed) not in self._allowed:
             scheme, host, port = origin(parsed)
-            raise _invalid(source, f"'{scheme}://{host}:{port}' is not among the hosts that its operator allows")
+            raise _invalid(given, role, f"'{scheme}://{host}:{port}' is not among the hosts that its operator allows")
         return parsed
 
-    async def _fetch(self, source: _Input, state: _Fetch) -> str:
+    async def _fetch(self, source: _Fetch) -> str:
         """Fetch one file, and return its SHA-256."""
         async with AsyncExitStack() as stack:
-            response = await self._open(source, state, stack)
+            response = await self._open(source, stack)
             declared = int(response.headers.get("content-length", "0"))  # only digits: h11 refuses anything else
-            self._check_size(declared, state)
-            await asyncio.to_thread(state.receipt.charge, declared)
+            self._check_size(declared, source)
+            await asyncio.to_thread(source.receipt.charge, declared)
             chunks = response.aiter_raw(memory.share())
-            run = partial(self.threads.run, state.receipt.owner)
+            run = partial(self.threads.run, source.receipt.owner)
             file = await run(self._blobs.receive, self._settings.max_upload_bytes)
             try:
-                while chunk := await self._in_time(source, state, anext(chunks, b"")):
-                    state.left -= len(chunk)
-                    self._check_size(0, state)
-                    await run(_write, chunk, file, state.receipt)
+                while chunk := await self._in_time(source, anext(chunks, b"")):
+                    self._check_size(len(chunk), source)
+                    await run(_write, chunk, file, source.receipt)
                 name = staged_name(source.role, file_name(source.url))
-                sha256 = await run(_keep, file, source.role, name, self._blobs, state.receipt, size=file.size)
+                sha256 = await run(_keep, file, source.role, name, self._blobs, source.receipt, size=file.size)
             except BaseException:
                 await self.threads.clean_up(run(file.discard))
                 raise
             _log.info("input fetched: host=%s bytes=%d", parse_url(source.url).host, file.size)
             return sha256
 
-    async def _open(self, source: _Input, state: _Fetch, stack: AsyncExitStack) -> httpx2.Response:
+    async def _open(self, source: _Fetch, stack: AsyncExitStack) -> httpx2.Response:
         """Follow redirects to the file, and return the response with it. The stack closes the connection."""
-        url = self._parse(source.url, source)
+        url = self._parse(source.url, source.url, source.role)
         for _ in range(1 + _MAX_REDIRECTS):
             answer = send("GET", url, _HEADERS, private_allowed=self._settings.url_private_addresses)
-            response = await self._in_time(source, state, stack.enter_async_context(answer))
+            response = await self._in_time(source, stack.enter_async_context(answer))
             location = response.headers.get("location")
             if response.status_code not in _REDIRECTS or location is None:
                 if response.status_code != httpx2.codes.OK:
@@ -624,25 +619,25 @@ class Fetcher:
                 target = str(url.join(location))
             except (httpx2.InvalidURL, ValueError) as error:
                 raise _not_fetched(source, _INVALID_REDIRECT) from error
-            url = self._parse(target, source)
+            url = self._parse(target, source.url, source.role)
         raise _not_fetched(source, f"the server redirects more than {_MAX_REDIRECTS} times")
 
-    def _check_size(self, more: int, state: _Fetch) -> None:
-        if more > state.left:
+    def _check_size(self, more: int, source: _Fetch) -> None:
+        if source.receipt.received + more > source.most:
             limit = self._settings.url_bytes
             raise problems.TOO_LARGE(
                 f"The inputs by URL have more than {limit:,} bytes. Upload large files.", limit=limit
             )
 
-    async def _in_time(self, source: _Input, state: _Fetch, step: Awaitable[Value]) -> Value:
+    async def _in_time(self, source: _Fetch, step: Awaitable[Value]) -> Value:
         """Wait for a step until the deadline; raise URL_NOT_FETCHED or INVALID_URL if the network fails."""
         try:
-            async with asyncio.timeout_at(state.deadline):
+            async with asyncio.timeout_at(source.deadline):
                 return await step
         except TimeoutError as error:
             raise _not_fetched(source, f"it did not arrive within {self._settings.url_seconds:g} s") from error
         except PermissionError as error:  # its message has the address, which is none of the client's business
-            raise _invalid(source, "its host has an address that is not public") from error
+            raise _invalid(source.url, source.role, "its host has an address that is not public") from error
         except httpx2.InvalidURL as error:  # httpx2 parses the target of a redirect even if it does not follow it
             raise _not_fetched(source, _INVALID_REDIRECT) from error
         except (httpx2.HTTPError, OSError) as error:
@@ -650,11 +645,11 @@ class Fetcher:
             raise _not_fetched(source, reason) from error
 
 
-def _invalid(source: _Input, reason: object) -> ServiceError:
-    return problems.INVALID_URL(url=source.url[:100], reason=reason, input=source.role)
+def _invalid(url: str, role: str, reason: object) -> ServiceError:
+    return problems.INVALID_URL(url=url[:100], reason=reason, input=role)
 
 
-def _not_fetched(source: _Input, reason: str) -> ServiceError:
+def _not_fetched(source: _Fetch, reason: str) -> ServiceError:
     return problems.URL_NOT_FETCHED(url=source.url[:100], reason=reason, input=source.role)
 
 

@@ -22,22 +22,6 @@ _CATEGORY = "3d/splat"
 _STEPS = 1000
 
 
-def _service_input() -> Any:
-    return IO.String.Input(
-        "service",
-        default="",
-        optional=True,
-        advanced=True,
-        tooltip="Address of the service; empty for SGSST_URL, or http://127.0.0.1:8000. The key in SGSST_KEY is only "
-        "sent to the service of SGSST_URL.",
-    )
-
-
-def _tensor(image: Image.Image) -> torch.Tensor:
-    """Return an image as ComfyUI stores it, [1, height, width, 3] float32 in 0..1."""
-    return torch.from_numpy(np.asarray(image.convert("RGB"), dtype=np.float32) / 255)[None]
-
-
 def _real_count(splat: Any) -> int:
     """Return the number of Gaussians of a single splat without padding.
 
@@ -86,7 +70,14 @@ class Stylize(IO.ComfyNode):
                     default="-y",
                     tooltip="Up axis of the splat; ComfyUI's own splats have -y.",
                 ),
-                _service_input(),
+                IO.String.Input(
+                    "service",
+                    default="",
+                    optional=True,
+                    advanced=True,
+                    tooltip="Address of the service; empty for SGSST_URL, or http://127.0.0.1:8000. The key in "
+                    "SGSST_KEY is only sent to the service of SGSST_URL.",
+                ),
             ],
             outputs=[
                 IO.Splat.Output(display_name="stylized"),
@@ -120,6 +111,8 @@ class Stylize(IO.ComfyNode):
 def _follow(connection: Service, job_id: str) -> torch.Tensor:
     """Wait until a job has succeeded, show its progress and newest image, and return the last image.
 
+    It is an image of ComfyUI, [1, height, width, 3] float32 in 0..1.
+
     Raises:
         comfy.model_management.InterruptProcessingException: If the user interrupts, which cancels the job.
     """
@@ -138,7 +131,7 @@ def _follow(connection: Service, job_id: str) -> torch.Tensor:
         connection.cancel(job_id)
         raise
     assert image is not None
-    return _tensor(image)
+    return torch.from_numpy(np.asarray(image.convert("RGB"), dtype=np.float32) / 255)[None]
 
 
 class Blend(IO.ComfyNode):
