@@ -1,5 +1,5 @@
-"""What clients send: `/v1/uploads`, files in resumable parts, and `POST /v1/jobs`, a job that is queued, or planned,
-after all its files have been read and checked.
+"""Requests that bring files: `/v1/uploads`, files in resumable parts, and `POST /v1/jobs`, a job that is queued, or
+planned, after all its files have been read and checked.
 
 Uploads follow the tus protocol 1.0 (https://tus.io/protocols/resumable-upload).
 """
