@@ -49,7 +49,6 @@ from worker.options import (
 from worker.outputs import Outputs, check_suffix
 
 if TYPE_CHECKING:
-    from api.cli.scene_tools import VariantsRequest
     from sgsst_core.bench.variants import Curve
     from worker.derived import VideoRequest
 
@@ -413,15 +412,6 @@ class VariantsInputs:
     cameras: CamerasOption = None
     seconds: Annotated[float, typer.Option(min=1, max=1e6, help="Seconds of optimization per variant.")] = 300.0
 
-    def request(self, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path) -> VariantsRequest:
-        """Return the request for these variants, which are separated by commas."""
-        from api.cli.scene_tools import VariantsRequest
-
-        source = source_of(self.scene, self.cameras, options)
-        settings = {**chosen.given_settings(), "near": options.near}
-        names = [name.strip() for name in variants.split(",") if name.strip()]
-        return VariantsRequest(source, self.style, out, names, self.seconds, chosen.backbone, settings)
-
 
 @bench_app.command("error-time")
 @with_options(ViewOptions)
@@ -440,8 +430,7 @@ def error_time(
     """Run variants of a job for the same time each, and plot the remaining error against time."""
     from api.cli.scene_tools import point_line, run_error_time
 
-    request = inputs.request(options, chosen, variants, out)
-    curves = run_error_time(request, lambda curve: out_console.print(point_line(curve)))
+    curves = run_error_time(inputs, options, chosen, variants, out, lambda curve: out_console.print(point_line(curve)))
     _print_skipped_variants(curves, out)
 
 
@@ -464,8 +453,7 @@ def quality(
     """Run variants of a job for the same time each, and judge results with a network that none of them optimizes."""
     from api.cli.scene_tools import point_line, quality_table, run_quality
 
-    request = inputs.request(options, chosen, variants, out)
-    quality = run_quality(request, lambda curve: error_console.print(point_line(curve)))
+    quality = run_quality(inputs, options, chosen, variants, out, lambda curve: error_console.print(point_line(curve)))
     Console(width=_TABLE_WIDTH).print(quality_table(quality))
     _print_skipped_variants(quality.curves, out)
 

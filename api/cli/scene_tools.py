@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ import torch
 from rich.table import Column, Table
 from torch import Tensor
 
-from api.cli.options import local_path
+from api.cli.options import local_path, source_of
 from api.static_files import FOLDER
 from sgsst_core.devices import seconds_left
 from sgsst_core.errors import SettingsError
@@ -40,12 +39,13 @@ from worker.capture import orbit_request
 from worker.derived import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice
-from worker.options import ViewOptions, split_weight
+from worker.options import StylizeOptions, ViewOptions, split_weight
 from worker.outputs import check_is_not_input, check_suffix
 from worker.painting import camera_named
 from worker.prepare import dry_run
 
-if TYPE_CHECKING:  # it imports matplotlib, for which the other commands need not wait
+if TYPE_CHECKING:  # the second one imports matplotlib, for which the other commands need not wait
+    from api.cli.scene_commands import VariantsInputs
     from sgsst_core.bench.variants import Curve, Quality
 
 # --- demo ----------------------------------------------------------------------------------------------------------
@@ -257,62 +257,48 @@ def blend_files(
 # --- bench -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class VariantsRequest:
-    """Request of `sgsst bench error-time` or `sgsst bench quality`.
+def _read_variants(
+    inputs: VariantsInputs, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path
+) -> tuple[SceneFile, dict[str, Any], dict[str, Any]]:
+    """Check and read the files of a comparison of variants; the quick checks come first.
 
-    Attributes:
-        out: Folder for table, plot, JSON and scenes.
-        variants: Names of variants; empty for all.
-        seconds: Seconds of optimization per variant.
-        backbone: "auto", "vgg19" or "vgg16".
-        settings: Settings of all variants, on top of the standard preset.
-    """
-
-    source: SceneRequest
-    style: Path
-    out: Path
-    variants: Sequence[str]
-    seconds: float
-    backbone: str
-    settings: dict[str, Any]
-
-    @property
-    def title(self) -> str:
-        """Scene and style, for titles of plots."""
-        return f"{self.source.scene.parent.name or self.source.scene.stem}, {self.style.stem}"
-
-
-def _read_variants(request: VariantsRequest) -> tuple[SceneFile, dict[str, Any], dict[str, Any]]:
-    """Check and read the files of a request; the quick checks come first.
+    Args:
+        chosen: Options of all variants, on top of the standard preset.
+        variants: Names of variants, separated by commas; empty for all.
+        out: Folder for plots, JSON and scenes.
 
     Returns:
-        The scene's file, the arguments of `error_time` besides `progress`, and the request as a JSON object.
+        The scene's file, the arguments of `error_time` besides `progress`, and the comparison as a JSON object.
     """
     from sgsst_core.bench.variants import choose_variants
 
-    variants = choose_variants(request.variants)
-    weights = load_network_weights(request.backbone)
-    style = load_image(request.style)
-    file, capture = read_scene_and_capture(request.source)
-    ensure_writable_folder(request.out)
-    read = {"scene": file.scene, "cameras": capture.cameras, "style": style, "variants": variants, "weights": weights}
+    compared = choose_variants([name.strip() for name in variants.split(",") if name.strip()])
+    weights = load_network_weights(chosen.backbone)
+    style = load_image(inputs.style)
+    file, capture = read_scene_and_capture(source_of(inputs.scene, inputs.cameras, options))
+    ensure_writable_folder(out)
+    settings = {**chosen.given_settings(), "near": options.near}
+    read = {"scene": file.scene, "cameras": capture.cameras, "style": style, "variants": compared, "weights": weights}
     described = {
         "version": 1,
-        "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
-        "style": request.style.name,
+        "scene": inputs.scene.parent.name + "/" + inputs.scene.name,
+        "style": inputs.style.name,
         "views": len(capture.cameras),
         "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in capture.cameras})],
-        "budget_seconds": request.seconds,
-        "settings": request.settings,
+        "budget_seconds": inputs.seconds,
+        "settings": settings,
         "backbone": weights.name,
         "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
     }
-    return file, {**read, "seconds": request.seconds, **request.settings}, described
+    return file, {**read, "seconds": inputs.seconds, **settings}, described
 
 
-def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
+def run_error_time(
+    inputs: VariantsInputs, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path, progress: Any
+) -> list[Curve]:
     """Run the variants, and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
+
+    The other arguments are those of `_read_variants`.
 
     Args:
         progress: Callback that receives a curve after each of its evaluations.
@@ -322,31 +308,33 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
     """
     from sgsst_core.bench.variants import as_dict, error_time, write_plot
 
-    file, arguments, described = _read_variants(request)
+    file, arguments, described = _read_variants(inputs, options, chosen, variants, out)
     curves = error_time(**arguments, progress=progress)
-    write_json(request.out / "error_time.json", {**described, **as_dict(curves)})
-    write_plot(request.out / "error_time.png", curves, request.title)
+    write_json(out / "error_time.json", {**described, **as_dict(curves)})
+    write_plot(out / "error_time.png", curves, f"{described['scene']}, {described['style']}")
     for curve in curves:
         if curve.sh_dc is not None:
-            write_stylized(file, request.out / f"{curve.variant.name}.ply", curve.sh_dc)
+            write_stylized(file, out / f"{curve.variant.name}.ply", curve.sh_dc)
     return curves
 
 
-def run_quality(request: VariantsRequest, progress: Any) -> Quality:
+def run_quality(
+    inputs: VariantsInputs, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path, progress: Any
+) -> Quality:
     """Run the variants, measure their quality, and write `quality.json`, plots, `quality.jpg` and scenes.
 
     Arguments and errors are those of `run_error_time`.
     """
     from sgsst_core.bench.variants import compare_quality, write_plot, write_quality_plot, write_sheet
 
-    file, arguments, described = _read_variants(request)
+    file, arguments, described = _read_variants(inputs, options, chosen, variants, out)
     quality = compare_quality(**arguments, progress=progress)
-    write_json(request.out / "quality.json", {**described, **quality.as_dict()})
-    write_quality_plot(request.out / "quality.png", quality, request.title)
-    write_plot(request.out / "error_time.png", quality.curves, request.title)
-    write_sheet(request.out / "quality.jpg", quality)
+    write_json(out / "quality.json", {**described, **quality.as_dict()})
+    write_quality_plot(out / "quality.png", quality, f"{described['scene']}, {described['style']}")
+    write_plot(out / "error_time.png", quality.curves, f"{described['scene']}, {described['style']}")
+    write_sheet(out / "quality.jpg", quality)
     for outcome in quality.outcomes[1:]:
-        write_stylized(file, request.out / f"{outcome.name}.ply", outcome.sh_dc)
+        write_stylized(file, out / f"{outcome.name}.ply", outcome.sh_dc)
     return quality
 
 
