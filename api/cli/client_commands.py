@@ -336,9 +336,11 @@ def mcp(
     key: KeyOption = None,
 ) -> None:
     """Serve the tools of a language model on standard input and output, by the Model Context Protocol."""
+    import anyio
+
     from api.cli.mcp_server import serve
 
-    serve(root, url, key)
+    anyio.run(serve, root, url, key)
 
 
 #: Commands that request an action on a job, by name.

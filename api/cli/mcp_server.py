@@ -219,26 +219,17 @@ def _messages() -> Iterator[None]:
         raise ToolError(str(error)) from error
 
 
-def make_server(client: AsyncClient, root: Path) -> MCPServer[None]:
-    """Return the server with its tools, which read and write files below `root`."""
+async def serve(root: Path, url: str | None, key: str | None) -> None:
+    """Serve on standard input and output until the input ends; files are below `root`."""
     server: MCPServer[None] = MCPServer(
         "sgsst", instructions=_INSTRUCTIONS, version=installed_version(), log_level="WARNING"
     )
-    tools = Tools(client, root)
-    server.add_tool(tools.estimate, annotations=_READS)
-    server.add_tool(tools.submit, annotations=_CREATES)
-    server.add_tool(tools.status, annotations=_READS)
-    server.add_tool(tools.result, annotations=_CREATES)
-    server.add_tool(tools.blend, annotations=_CREATES)
-    server.add_tool(tools.share, annotations=_CREATES)
-    return server
-
-
-def serve(root: Path, url: str | None, key: str | None) -> None:
-    """Serve on standard input and output until the input ends; files are below `root`."""
-    anyio.run(_serve, root, url, key)
-
-
-async def _serve(root: Path, url: str | None, key: str | None) -> None:
     async with AsyncClient(url, key) as client:
-        await make_server(client, root).run_stdio_async()
+        tools = Tools(client, root)
+        server.add_tool(tools.estimate, annotations=_READS)
+        server.add_tool(tools.submit, annotations=_CREATES)
+        server.add_tool(tools.status, annotations=_READS)
+        server.add_tool(tools.result, annotations=_CREATES)
+        server.add_tool(tools.blend, annotations=_CREATES)
+        server.add_tool(tools.share, annotations=_CREATES)
+        await server.run_stdio_async()
