@@ -51,23 +51,6 @@ IfNoneMatch = Annotated[
         examples=['"e7d2c939"'],
     ),
 ]
-IfMatch = Annotated[
-    str | None,
-    Header(
-        alias="If-Match",
-        description="ETag of the expected content; if the file has changed, the answer is 412.",
-        examples=[f'"{SHA256}"'],
-    ),
-]
-RangeHeader = Annotated[str | None, Header(alias="Range", description="One range of bytes.", examples=["bytes=0-1023"])]
-IfRange = Annotated[
-    str | None,
-    Header(
-        alias="If-Range",
-        description="ETag of the partial file; if the file has changed, it is sent as a whole.",
-        examples=[f'"{SHA256}"'],
-    ),
-]
 
 
 @raises(problems.RANGE_NOT_SATISFIABLE, problems.PRECONDITION_FAILED)
@@ -75,10 +58,26 @@ IfRange = Annotated[
 class Conditions:
     """Headers of a request that ask for a range of a file, or for the file only if it has changed."""
 
-    range_: RangeHeader = None
-    if_range: IfRange = None
+    range_: Annotated[
+        str | None, Header(alias="Range", description="One range of bytes.", examples=["bytes=0-1023"])
+    ] = None
+    if_range: Annotated[
+        str | None,
+        Header(
+            alias="If-Range",
+            description="ETag of the partial file; if the file has changed, it is sent as a whole.",
+            examples=[f'"{SHA256}"'],
+        ),
+    ] = None
     if_none_match: IfNoneMatch = None
-    if_match: IfMatch = None
+    if_match: Annotated[
+        str | None,
+        Header(
+            alias="If-Match",
+            description="ETag of the expected content; if the file has changed, the answer is 412.",
+            examples=[f'"{SHA256}"'],
+        ),
+    ] = None
 
 
 ConditionsDep = Annotated[Conditions, Depends()]

@@ -88,27 +88,21 @@ IdempotencyHeader = Annotated[
     ),
 ]
 UploadId = Annotated[str, Path(description="ID of an upload.", examples=[UPLOAD_ID])]
-Tus = Annotated[
-    str,
-    Header(
-        alias="Tus-Resumable",
-        description="Protocol version. Requests without it are rejected.",
-        examples=[VERSION],
-        json_schema_extra={"const": VERSION},
-    ),
-]
-LengthHeader = Annotated[
-    Digits,
-    Header(alias="Upload-Length", ge=0, lt=2**60, description="Size of the whole file in bytes.", examples=[42301]),
-]
-OffsetHeader = Annotated[
-    Digits,
-    Header(alias="Upload-Offset", ge=0, lt=2**60, description="Offset of these bytes in the file.", examples=[16384]),
-]
 
 
 @raises(problems.TUS_VERSION, problems.TUS_EXTENSION)
-def check_protocol(request: Request, tus: Tus = "") -> None:
+def check_protocol(
+    request: Request,
+    tus: Annotated[
+        str,
+        Header(
+            alias="Tus-Resumable",
+            description="Protocol version. Requests without it are rejected.",
+            examples=[VERSION],
+            json_schema_extra={"const": VERSION},
+        ),
+    ] = "",
+) -> None:
     """Refuse a request that does not state the protocol version, or uses an unsupported extension.
 
     tus requires the version for all methods except OPTIONS.
@@ -179,7 +173,10 @@ def describe_uploads(context: ContextDep) -> Response:
 async def create_upload(
     context: ContextDep,
     caller: CallerDep,
-    length: LengthHeader,
+    length: Annotated[
+        Digits,
+        Header(alias="Upload-Length", ge=0, lt=2**60, description="Size of the whole file in bytes.", examples=[42301]),
+    ],
     metadata: Annotated[
         str,
         Header(
@@ -289,7 +286,12 @@ async def append_upload(
     upload_id: UploadId,
     context: ContextDep,
     caller: CallerDep,
-    offset: OffsetHeader,
+    offset: Annotated[
+        Digits,
+        Header(
+            alias="Upload-Offset", ge=0, lt=2**60, description="Offset of these bytes in the file.", examples=[16384]
+        ),
+    ],
     checksum: Annotated[
         str | None,
         Header(
