@@ -21,7 +21,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from api.http.static import static_files
+from api.http.sending import static_files
 from sgsst_core.features.network_weights import BackboneWeights
 from tests.small_scenes import wall, write_files
 
@@ -121,7 +121,7 @@ def test_wheel_contains_the_licenses_of_its_files(wheel: Path) -> None:
 
 def test_web_page_and_its_assets_are_installed(installed: Path, tmp_path: Path) -> None:
     code = (
-        "from api.http.static import static_files as served; print(served().digest, *served().pages, *served().files)"
+        "from api.http.sending import static_files as served; print(served().digest, *served().pages, *served().files)"
     )
     digest, *names = run([installed / "python", "-c", code], tmp_path).split()
     assert digest == static_files().digest, "another byte"

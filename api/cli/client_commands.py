@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -11,7 +10,7 @@ from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
-from rich.progress import BarColumn, ProgressColumn, TextColumn
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn
 from rich.table import Column, Table
 
 from api.cli import INTERRUPTED
@@ -26,6 +25,7 @@ from api.cli.console import (
 )
 from api.cli.options import (
     JsonOption,
+    KeyOption,
     SubmittedArguments,
     cameras_of,
     file_to_write,
@@ -33,22 +33,18 @@ from api.cli.options import (
     with_arguments,
     with_options,
 )
-from api.client.uploads import different_names
+from api.client.client import different_names
 from service.inputs import JobParameters
 from service.states import ACTIONS, STEPPING, Transition, WebhookEvent
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.atomic import file_digest
 from sgsst_core.files.formats import (
     DOWNLOAD_SUFFIXES,
-    DOWNLOADS,
-    EXTRA_FORMATS,
-    FORMATS,
-    DownloadName,
     download_of_name,
     listed,
     result_name,
 )
-from sgsst_core.progress import Progress, duration, live_bar, set_total
+from sgsst_core.progress import Progress, duration, live_bar
 from worker.job import check_file, check_folder, check_is_not_input
 from worker.options import ESSENTIALS, RegionOptions, parse_styles, path_or_url, region_requests, split_weight
 
@@ -61,7 +57,6 @@ if TYPE_CHECKING:
 UrlOption = Annotated[
     str | None, typer.Option("--url", help="URL of the service. [default: SGSST_URL, else http://127.0.0.1:8000]")
 ]
-KeyOption = Annotated[str | None, typer.Option("--key", help="API key. [default: SGSST_KEY]")]
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="ID of a job.", show_default=False)]
 
 
@@ -77,7 +72,6 @@ def submit(
     inputs: SubmittedArguments,
     *,
     options: JobParameters,
-    parameters: Annotated[str, typer.Option(metavar="JSON", help="Additional parameters, as in the REST API.")] = "{}",
     webhook: Annotated[str | None, typer.Option(help="URL to notify when the job ends.")] = None,
     webhook_events: Annotated[
         list[str] | None,
@@ -112,7 +106,7 @@ def submit(
         check_is_not_input(out, Path(inputs.scene))
     if webhook_events and not webhook:
         raise SettingsError("--webhook-events requires --webhook. Add it, or omit the events.")
-    styles, masks, settings = _styles_masks_and_parameters(inputs, options, parameters)
+    styles, masks, settings = _styles_masks_and_parameters(inputs, options)
     cameras = cameras_of(inputs.scene, inputs.cameras, JobParameters.model_construct(**settings))
     files: dict[str, Any] = {"cameras": cameras, "photos": inputs.images, "masks": masks}
     files["painted"] = {file.path: file.options.model_dump(exclude_none=True) for file in inputs.painted}
@@ -136,7 +130,7 @@ def submit(
 
 
 def _styles_masks_and_parameters(
-    inputs: SubmittedArguments, options: JobParameters, parameters: str
+    inputs: SubmittedArguments, options: JobParameters
 ) -> tuple[list[Path | str], dict[str, Path], dict[str, Any]]:
     """Return the style images to send or their URLs, those of regions last, the masks, and the job's parameters."""
     values = options.model_dump(mode="json", exclude_unset=True)
@@ -153,7 +147,7 @@ def _styles_masks_and_parameters(
         local = [image for image in images if isinstance(image, Path)]
         names = different_names([*local, *of_regions])[len(local) :]
         values["regions"], masks = _regions_to_send(regions, names)
-    return [*images, *of_regions], masks, values | _parse_parameters(parameters)
+    return [*images, *of_regions], masks, values
 
 
 def _regions_to_send(
@@ -199,11 +193,10 @@ def download(
     ),
     out: Annotated[
         Path | None,
-        typer.Option(help="File to write, or folder for 'all'. [default: NAME]", callback=path_to_write),
-    ] = None,
-    format: Annotated[
-        DownloadName | None,
-        typer.Option("--format", help="Format of stylized.ply. [default: from the ending of --out]"),
+        typer.Option(
+            help="File to write, whose ending is the format of stylized.ply, or folder for 'all'. [default: NAME]",
+            callback=path_to_write,
+        ),
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace existing files, which may belong to another job.")
@@ -213,15 +206,12 @@ def download(
     key: KeyOption = None,
 ) -> None:
     """Download a job's result or other files; an interrupted download resumes."""
-    if format and name not in ("stylized.ply", "all"):
-        raise SettingsError(f"--format {format}: only stylized.ply has other formats. Omit --format for {name}.")
-    if format is None and out is not None and name == "stylized.ply":
-        format = download_of_name(out.name)
     if name == "all":
         check_folder(out or Path(job))
     elif out is not None:
         check_file(out)
-        _check_format(out, _stored_name(name, format))
+        if name == "stylized.ply":
+            download_of_name(out.name)
     with open_client(url, key) as client:
         digests = {entry["name"]: entry["sha256"] for entry in client.artifacts(job)}
         names = list(digests) if name == "all" else [name]
@@ -229,21 +219,17 @@ def download(
             _check_names(names)
         written = []
         for each in names:
-            stored = _stored_name(each, format)
-            target = (out or Path(job)) / stored if name == "all" else out or Path(Path(stored).name)
-            chosen = format if each == "stylized.ply" else None
-            if not (overwrite or (name == "all" and out is None)):  # that folder is named after the job
-                _check_target(target, digests.get(stored))
+            target = (out or Path(job)) / each if name == "all" else out or Path(Path(each).name)
+            stored = result_name(each, download_of_name(target.name)) if each == "stylized.ply" else each
+            other = target.is_file() and digests.get(stored) != file_digest(target)
+            if other and not overwrite and not (name == "all" and out is None):  # that folder is named after the job
+                raise OutputError(
+                    f"{target}: exists, and is not this job's file. Write to another file with --out, or pass "
+                    "--overwrite."
+                )
             with transfer_bar(error_console, each) as progress:
-                written.append(str(client.download(job, target, each, progress, chosen)))
-            if not as_json:
-                _print_compression_loss(client, job, chosen)
+                written.append(str(client.download(job, target, each, progress)))
     out_console.print(json.dumps(written) if as_json else "\n".join(written))
-
-
-def _stored_name(name: str, format: DownloadName | None) -> str:
-    """Return the name under which the service stores an artifact in another format, which only results have."""
-    return result_name(name, format) if format and name == "stylized.ply" else name
 
 
 def _check_names(names: Sequence[str]) -> None:
@@ -255,33 +241,6 @@ def _check_names(names: Sequence[str]) -> None:
                 f"The service names a file {name!r}, which is outside of the download's folder. Check --url, "
                 "or download single files by name."
             )
-
-
-def _check_format(out: Path, name: str) -> None:
-    """Raise an OutputError if the name of a file to write is that of another format than an artifact's."""
-    formats = {*DOWNLOADS, *(each.name for each in FORMATS)}
-
-    def format_of(name: str) -> str:
-        return max((each for each in formats if name.lower().endswith(f".{each}")), key=len, default="")
-
-    given, content = format_of(out.name), format_of(name)
-    if given and content and given != content:
-        raise OutputError(
-            f"{out}: ends in .{given}, but the format of the download is {content}. Give a name that ends in "
-            f".{content}."
-        )
-
-
-def _check_target(target: Path, sha256: str | None) -> None:
-    """Raise an OutputError if a file exists whose content is not that of the artifact to download.
-
-    Args:
-        sha256: SHA-256 of the artifact; None if it does not exist yet.
-    """
-    if target.is_file() and sha256 != file_digest(target):
-        raise OutputError(
-            f"{target}: exists, and is not this job's file. Write to another file with --out, or pass --overwrite."
-        )
 
 
 def _command_of(action: Transition) -> Callable[..., None]:
@@ -330,17 +289,12 @@ def jobs(
     if as_json:
         out_console.print(json.dumps([job.data for job in page]))
         return
-    console = PlainConsole()
-    widths = {"id": 35, "name": 0, "status": 13, "created": 11}
-    widths["name"] = max(console.width - sum(widths.values()) - 2 * (len(widths) - 1), len("name"))
-    table = Table(box=None, pad_edge=False)
-    for heading, width in widths.items():
-        table.add_column(heading, no_wrap=True, width=width)
+    fixed = (Column(heading, no_wrap=True) for heading in ("id", "status", "created"))
+    table = Table(*fixed, "name", box=None, pad_edge=False)
     for job in page:
         created = datetime.fromisoformat(job.data["created_at"]).astimezone()
-        name = _shortened(job.data["name"], widths["name"])
-        table.add_row(job.id, name, _short_status(job), f"{created:%m-%d %H:%M}")
-    console.print(table)
+        table.add_row(job.id, _short_status(job), f"{created:%m-%d %H:%M}", job.data["name"])
+    PlainConsole().print(table)
 
 
 def usage(
@@ -381,9 +335,11 @@ def mcp(
     key: KeyOption = None,
 ) -> None:
     """Serve the tools of a language model on standard input and output, by the Model Context Protocol."""
+    import anyio
+
     from api.cli.mcp_server import serve
 
-    serve(root, url, key)
+    anyio.run(serve, root, url, key)
 
 
 #: Commands that request an action on a job, by name.
@@ -402,51 +358,22 @@ def open_client(url: str | None, key: str | None) -> Client:
     return Client(url, key)
 
 
-def _shortened(name: str, width: int) -> str:
-    """Return a name without its middle if it is too wide; names of one scene's jobs differ at their ends."""
-    return name if len(name) <= width else f"{name[: (width - 1) // 2]}…{name[-(width // 2) :]}"
-
-
 def _print_retry(details: RetryDetails) -> None:
     what = str(details.caused_by) or type(details.caused_by).__name__
     error_console.print(f"{what}: retrying in {details.wait_for:.0f} s")
 
 
-def _parse_parameters(text: str) -> dict[str, Any]:
-    try:
-        values = json.loads(text)
-    except ValueError as error:
-        raise typer.BadParameter(
-            f'--parameters is not valid JSON: {error}. Give an object such as {{"steps_sos": 100}}.'
-        ) from error
-    if not isinstance(values, dict):
-        raise typer.BadParameter('--parameters is not a JSON object. Give one such as {"steps_sos": 100}.')
-    return values
-
-
 @contextmanager
 def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
     """Show a progress bar of the sent bytes, then of the surveyed views; only on a terminal."""
-    with live_bar(error_console, *_text_columns()) as bar:
-        task = bar.add_task("checking", total=None, text="")
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn()
+    with live_bar(error_console, *columns) as bar:
+        task = bar.add_task("checking", total=None)
 
-        def sent(done: int, total: int) -> None:
-            set_total(bar, None if done == total else total or None)
-            bar.update(task, description="sending", completed=done, text=f"{done / 1e6:.0f} MB")
-            if done == total:
-                bar.update(task, description="checking", text="")
+        def shown_as(what: str) -> Any:
+            return lambda done, total: bar.update(task, description=what, completed=done, total=total or None)
 
-        def planned(done: int, total: int) -> None:
-            text = "measuring the speed" if done == total else f"view {done} of {total}"
-            set_total(bar, None if done == total else total)
-            bar.update(task, description="planning", completed=done, text=text)
-
-        yield sent, planned
-
-
-def _text_columns() -> tuple[ProgressColumn, ...]:
-    """Return the columns of a bar between a description and a text, which may be the service's."""
-    return TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[text]}", markup=False)
+        yield shown_as("sending"), shown_as("planning")
 
 
 def follow(client: Client, job_id: str, as_json: bool) -> Job:
@@ -463,7 +390,8 @@ def follow(client: Client, job_id: str, as_json: bool) -> Job:
 def _show_events(client: Client, job_id: str, as_json: bool) -> Job:
     """Show events until the job has ended: as a live bar on a terminal, as lines elsewhere, or as JSON lines."""
     live = error_console.is_terminal and not as_json
-    with live_bar(error_console, *_text_columns(), enabled=not as_json) as bar:
+    title, text = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[text]}", markup=False)
+    with live_bar(error_console, title, BarColumn(), text, enabled=not as_json) as bar:
         task = bar.add_task("waiting", total=1.0, text="")
         for event in client.watch(job_id):
             if as_json:
@@ -473,10 +401,10 @@ def _show_events(client: Client, job_id: str, as_json: bool) -> Job:
                 if not live:
                     error_console.print(f"{event.data['status']} (attempt {event.data['attempt']})")
             elif event.kind == "progress":
-                text = Progress.model_validate(event.data).text()
-                bar.update(task, completed=event.data["fraction"], text=text)
+                line = Progress.model_validate(event.data).text()
+                bar.update(task, completed=event.data["fraction"], text=line)
                 if not live:
-                    error_console.print(text)
+                    error_console.print(line)
     return client.job(job_id)
 
 
@@ -492,22 +420,7 @@ def conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
         )
     with transfer_bar(error_console, out.name) as progress:
         client.download(job.id, out, progress=progress)
-    if not as_json:
-        _print_compression_loss(client, job.id, download_of_name(out.name))
     out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
-
-
-def _print_compression_loss(client: Client, job_id: str, format: DownloadName | None) -> None:
-    """Print the quality loss of a compressed result; nothing for other formats."""
-    if format not in [each.name for each in EXTRA_FORMATS]:
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        name = f"{result_name('stylized.ply', format)}.json"
-        loss = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
-    psnr = "renders identical to" if loss["psnr_db"] is None else f"{loss['psnr_db']:.1f} dB PSNR against"
-    error_console.print(f"{format}, {loss['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
-    for warning in loss.get("warnings", []):
-        error_console.print(f"warning: {warning}")
 
 
 def _print_job(job: Job, as_json: bool) -> None:
@@ -521,7 +434,7 @@ def _progress_text(job: Job) -> str:
 
 
 def _short_status(job: Job) -> str:
-    """Return the status of a job with its position in the queue or its progress, in at most 13 characters."""
+    """Return the status of a job with its position in the queue or its progress."""
     if job.status == "queued" and job.data.get("queue_position"):
         return f"queued, #{job.data['queue_position']}"
     if job.progress and job.status in STEPPING and job.progress["total"]:

@@ -87,16 +87,6 @@ def print_field(name: str, value: object) -> None:
 
 
 @contextmanager
-def spinner(text: str) -> Iterator[None]:
-    """Show a spinner on a terminal, and nothing elsewhere."""
-    if not error_console.is_terminal:
-        yield
-        return
-    with error_console.status(text):
-        yield
-
-
-@contextmanager
 def transfer_bar(console: Console, description: str) -> Iterator[Callable[[int, int], None]]:
     """Show the progress of a transfer; yield a function that receives the transferred and the total bytes."""
     from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn

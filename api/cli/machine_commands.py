@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
@@ -12,9 +18,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.table import Table
 
-from api.cli.console import FAILURE, PlainConsole, error_console, out_console, transfer_bar
+from api.cli.console import FAILURE, PlainConsole, error_console, leave_terminal, out_console, transfer_bar
 from api.cli.options import JsonOption
 from sgsst_core.errors import SettingsError
+from worker.processes import STOP_SIGNALS
 
 if TYPE_CHECKING:
     from service.settings import ServiceSettings
@@ -114,10 +121,120 @@ def serve(
     """Run the service on this machine: HTTP API and dispatcher. Environment variables SGSST_... configure it."""
     chosen = {"SGSST_HOST": host, "SGSST_PORT": port}
     os.environ.update({name: str(value) for name, value in chosen.items() if value is not None})
-    settings = _service_settings(data)
-    from api.cli.supervisor import serve as run
+    run_service(_service_settings(data), error_console.print)
 
-    run(settings, error_console.print)
+
+#: Least seconds between two starts of a process that dies.
+_START_SECONDS = 3.0
+_LOOK_SECONDS = 0.2
+#: Seconds that processes have to stop, on top of the time that jobs have to save their state.
+_LAST_SECONDS = 15.0
+_BACKLOG = 1024
+
+
+def run_service(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
+    """Run API and dispatcher until SIGTERM, Ctrl-C or the end of the terminal; running jobs then save their state.
+
+    A second signal ends at once. Either process is started again when it dies.
+
+    This process owns the listening socket, so that connections wait during a restart of the API instead of being
+    refused.
+
+    Raises:
+        SettingsError: If the address is in use, other machines can reach the service and no API key exists, or no
+            feature network is installed.
+    """
+    from service.settings import missing_extras
+
+    store = _open_store(settings)
+    if settings.keys_required and not any(key.revoked_at is None for key in store.keys.all()):
+        raise SettingsError(
+            f"{settings.host} can be reached from other machines, but there is no API key. Create one with "
+            "`sgsst keys create NAME`, or serve only this machine with --host 127.0.0.1."
+        )
+    store.close()
+    with _listen(settings) as listener:
+        if subprocess.run([sys.executable, "-P", "-m", "service.prepare", "weights"], check=False).returncode:
+            raise SettingsError(
+                "No feature network is installed, so no job can run. `sgsst weights list` shows where to get one."
+            )
+        for line in missing_extras():
+            announce(line)
+        signals: list[int] = []
+        for number in STOP_SIGNALS:
+            if signal.getsignal(number) != signal.SIG_IGN:  # as by `nohup`
+                signal.signal(number, lambda number, _: signals.append(number))
+        descriptor = listener.fileno()
+        api = [sys.executable, "-P", "-m", "api.http.server", "--fd", str(descriptor)]
+        dispatcher = [sys.executable, "-P", "-m", "service.scheduling.dispatcher"]
+        children = [_Child("API", api, descriptor), _Child("dispatcher", dispatcher)]
+        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        address = f"http://{host}:{listener.getsockname()[1]}"
+        announce(
+            f"Serving at {address}/ (API documentation: {address}/docs). Data: {settings.folder}. Press Ctrl-C to stop."
+        )
+        _run(children, signals, settings, announce)
+
+
+def _listen(settings: ServiceSettings) -> socket.socket:
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    address, both = (settings.host, settings.port), family == socket.AF_INET6
+    try:
+        return socket.create_server(address, family=family, backlog=_BACKLOG, dualstack_ipv6=both)
+    except OSError as error:
+        raise SettingsError(
+            f"Cannot listen on {settings.host}:{settings.port}: {error.strerror}. Choose another port with --port."
+        ) from error
+
+
+class _Child:
+    """Child process, which dies with this process and does not receive Ctrl-C from the terminal.
+
+    Args:
+        descriptors: File descriptors that it inherits.
+    """
+
+    def __init__(self, name: str, command: list[str], *descriptors: int) -> None:
+        self._name, self._command, self._descriptors = name, command, descriptors
+        self._start()
+
+    def _start(self) -> None:
+        self.process = subprocess.Popen(
+            self._command,
+            pass_fds=self._descriptors,
+            env={**os.environ, "SGSST_DIE_WITH_PARENT": "1"},
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        self._started = time.monotonic()
+
+    def restart_if_dead(self, announce: Callable[[str], None]) -> None:
+        """Start the process again if it has died, unless it was started moments ago."""
+        if self.process.poll() is not None and time.monotonic() >= self._started + _START_SECONDS:
+            announce(f"The {self._name} exited with code {self.process.returncode}. Restarting it.")
+            self._start()
+
+
+def _run(
+    children: list[_Child], signals: list[int], settings: ServiceSettings, announce: Callable[[str], None]
+) -> None:
+    """Restart children that die until a signal arrives, then end all."""
+    while not signals:
+        for child in children:
+            child.restart_if_dead(announce)
+        time.sleep(_LOOK_SECONDS)
+    leave_terminal(signals[0])
+    announce("Stopping; running jobs save their state. Press Ctrl-C again to stop immediately.")
+    processes = [child.process for child in children]
+    for process in processes:
+        process.send_signal(signal.SIGTERM)
+    deadline = time.monotonic() + settings.stop_seconds + _LAST_SECONDS
+    while any(process.poll() is None for process in processes) and len(signals) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
 
 
 def fsck(
@@ -180,7 +297,7 @@ def create_key(
     from service.store.keys import Quotas
 
     quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
-    row, text = _open_store(data).keys.create(name, priority, quotas, operator=operator)
+    row, text = _open_store(_service_settings(data)).keys.create(name, priority, quotas, operator=operator)
     if as_json:
         out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
         return
@@ -191,7 +308,7 @@ def create_key(
 @keys_app.command("list")
 def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
     """List API keys, without the keys themselves."""
-    rows = _open_store(data).keys.all()
+    rows = _open_store(_service_settings(data)).keys.all()
     if as_json:
         shown = [
             {name: getattr(row, name) for name in ("id", "name", "priority", "operator")}
@@ -215,7 +332,7 @@ def revoke_key(
     data: DataOption = None,
 ) -> None:
     """Revoke an API key."""
-    row = _open_store(data).keys.revoke(key_id)
+    row = _open_store(_service_settings(data)).keys.revoke(key_id)
     error_console.print(f"Revoked key {row.id} of {row.name!r}.")
 
 
@@ -255,16 +372,16 @@ def _open_existing_store(data: Path | None) -> Store:
     """
     from sqlalchemy.engine import make_url
 
-    url = make_url(_service_settings(data).database_url)
+    settings = _service_settings(data)
+    url = make_url(settings.database_url)
     if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():  # which opening would create
         raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
-    return _open_store(data)
+    return _open_store(settings)
 
 
-def _open_store(data: Path | None) -> Store:
+def _open_store(settings: ServiceSettings) -> Store:
     from service.settings import keep_private
     from service.store import open_store
 
-    settings = _service_settings(data)
     keep_private(settings)
     return open_store(settings)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import io
 import json
-import re
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, requires
 from typing import Annotated, Any
 
 import typer
@@ -29,14 +27,16 @@ from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import DISK_FULL
 from worker.processes import process_start
 
-_DISTRIBUTION = "sgsst-service"
+#: Extra that installs a module, for modules that some commands need.
+_EXTRAS = {
+    **dict.fromkeys(("alembic", "fastapi", "fsspec", "pydantic_settings", "ray", "sqlalchemy", "uvicorn"), "service"),
+    **{"av": "video", "mcp": "mcp", "psycopg": "postgresql", "s3fs": "s3"},
+}
 #: Summaries of commands and groups of commands, by their modules, which are imported when one is called.
 _SUMMARIES: dict[str, dict[str, str]] = {
     "stylize_commands": {
         "stylize": "Stylize a scene with one or several style images.",
         "demo": "Stylize a built-in scene, lifted from a stereo photograph, in a few minutes.",
-    },
-    "batch_commands": {
         "batch": "Stylize several scenes in each of several styles; what is done already is not repeated.",
     },
     "scene_commands": {
@@ -190,10 +190,11 @@ def _run(invocation: Invocation) -> int:
         usual = BAD_INPUT if isinstance(error, InvalidInputError) else FAILURE
         return {404: NOT_FOUND, 409: CONFLICT}.get(getattr(error, "status", 0), usual)  # status of a response
     except ModuleNotFoundError as error:
-        problem = _missing_extra(error)
-        if problem is None:
+        module = (error.name or "").partition(".")[0]
+        if module not in _EXTRAS:
             raise
-        _print_error(arguments, "missing-extra", problem)
+        extra = f"which the extra `{_EXTRAS[module]}` installs. Run `pip install 'sgsst-service[{_EXTRAS[module]}]'`."
+        _print_error(arguments, "missing-extra", f"this command needs {module}, {extra}")
         return BAD_INPUT
     except (KeyboardInterrupt, typer.Abort):
         error_console.print(ABORTED)
@@ -213,26 +214,6 @@ def _run(invocation: Invocation) -> int:
             raise
         error_console.print("error: out of memory. Use a smaller --resolution, fewer --views or a --memory-limit.")
         return FAILURE
-
-
-def _missing_extra(error: ModuleNotFoundError) -> str | None:
-    """Return a message about the extra of this project that installs a missing module; None if none does.
-
-    Modules are named like their packages, with underscores.
-    """
-    module = (error.name or "").partition(".")[0]
-    try:
-        requirements = requires(_DISTRIBUTION) or ()
-    except PackageNotFoundError:
-        return None
-    for requirement in requirements:
-        matched = re.match(r"([\w.-]+).*\bextra == ['\"](\w+)['\"]", requirement)
-        if matched and matched[1].lower().replace("-", "_") == module:
-            return (
-                f"this command needs {matched[1]}, which the extra `{matched[2]}` installs. "
-                f"Run `pip install '{_DISTRIBUTION}[{matched[2]}]'`."
-            )
-    return None
 
 
 def _print_error(arguments: Sequence[str], code: str, detail: str, problem: Mapping[str, object] | None = None) -> None:

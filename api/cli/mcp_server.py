@@ -5,6 +5,7 @@ The SDK evaluates the annotations of the tools, so that all of their names are i
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -12,17 +13,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
-import anyio
 import anyio.to_thread
 from mcp.server.mcpserver import Image, MCPServer
 from mcp.server.mcpserver.exceptions import ToolError
 from mcp_types import CallToolResult, TextContent, ToolAnnotations
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from api import installed_version
 from api.client import AsyncClient
+from api.client.client import IMAGE_SUFFIXES, JobFiles, input_files
 from api.client.transport import Job
-from api.client.uploads import IMAGE_SUFFIXES, JobFiles, input_files
 from service.inputs import JobParameters
 from sgsst_core.errors import SgsstError
 from sgsst_core.files import formats
@@ -43,6 +43,8 @@ _SUFFIXES = {
     "cameras": (".json", ".bin", ".txt"),
     "photos": IMAGE_SUFFIXES,
 }
+#: What an estimate tells of a plan.
+_ESTIMATED = ("total_seconds", "memory_bytes", "gaussians", "views", "warnings")
 _READS = ToolAnnotations(read_only_hint=True, open_world_hint=False)
 _CREATES = ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
 
@@ -70,55 +72,6 @@ Out = Annotated[
 ]
 
 
-class Estimate(BaseModel):
-    """Time, memory and size of a job that was not queued."""
-
-    total_seconds: float | None
-    memory_bytes: int | None
-    gaussians: int
-    views: int
-    warnings: list[str]
-
-
-class State(BaseModel):
-    """State of a job."""
-
-    job_id: str
-    name: str
-    status: str
-    stage: str | None
-    fraction: float | None
-    eta_s: float | None
-    queue_position: int | None
-    result: dict[str, Any] | None
-    error: str | None
-    page: str
-
-
-class JobResult(BaseModel):
-    """Result of a job."""
-
-    job_id: str
-    status: str
-    urls: dict[str, str]
-    path: str | None
-
-
-class Blended(BaseModel):
-    """Stored blend."""
-
-    url: str
-    path: str | None
-
-
-class Link(BaseModel):
-    """Link to a result."""
-
-    url: str
-    embed_url: str | None
-    expires_at: str
-
-
 class Tools:
     """Tools of the MCP server. Expected errors become messages to the model.
 
@@ -131,27 +84,27 @@ class Tools:
 
     async def estimate(
         self, scene: Scene, style: Styles, cameras: Cameras = None, photos: Photos = None, options: Options = None
-    ) -> Estimate:
+    ) -> dict[str, Any]:
         """Check the files of a job and estimate its time and memory, without queueing it."""
         with _messages():
             files = await anyio.to_thread.run_sync(self._files, scene, style, cameras, photos)
             plan = await self._client.plan(**files, **_known(options))
-        return Estimate(**{name: plan[name] for name in Estimate.model_fields})
+        return {name: plan[name] for name in _ESTIMATED}
 
     async def submit(
         self, scene: Scene, style: Styles, cameras: Cameras = None, photos: Photos = None, options: Options = None
-    ) -> State:
+    ) -> dict[str, Any]:
         """Queue a job that stylizes a scene. It continues on the service whatever happens here."""
         with _messages():
             files = await anyio.to_thread.run_sync(self._files, scene, style, cameras, photos)
             return self._state(await self._client.submit(**files, **_known(options)))
 
-    async def status(self, job_id: JobId) -> State:
+    async def status(self, job_id: JobId) -> dict[str, Any]:
         """Show the status and progress of a job."""
         with _messages():
             return self._state(await self._client.job(job_id))
 
-    async def result(self, job_id: JobId, out: Out = None) -> Annotated[CallToolResult, JobResult]:
+    async def result(self, job_id: JobId, out: Out = None) -> Annotated[CallToolResult, dict[str, Any]]:
         """Show the newest image of a job and the addresses of its files, and write its scene to a file."""
         with _messages():
             target = self._new_file(out, [f".{name}" for name in formats.DOWNLOADS])
@@ -165,10 +118,10 @@ class Tools:
                     file = await self._client.download(job_id, Path(folder) / "preview.jpg", preview)
                     image = Image(data=await anyio.to_thread.run_sync(file.read_bytes), format="jpeg")
         urls = {each["name"]: self._address(job_id, each["name"]) for each in artifacts}
-        result = JobResult(job_id=job_id, status=job.status, urls=urls, path=path)
-        text = TextContent(type="text", text=result.model_dump_json())
+        result = {"job_id": job_id, "status": job.status, "urls": urls, "path": path}
+        text = TextContent(type="text", text=json.dumps(result))
         content = [text] if image is None else [text, image.to_image_content()]
-        return CallToolResult(content=content, structured_content=result.model_dump(mode="json"))
+        return CallToolResult(content=content, structured_content=result)
 
     async def blend(
         self,
@@ -178,14 +131,14 @@ class Tools:
             dict[str, float] | None, Field(description="Weights of results of other jobs of the scene by job ID.")
         ] = None,
         out: Out = None,
-    ) -> Blended:
+    ) -> dict[str, str | None]:
         """Blend the scene of a finished job with its result, and with results of other jobs of the scene."""
         with _messages():
             target = self._new_file(out, [each.suffix for each in formats.RESULT_FORMATS])
             format = formats.format_of_name(target.name) if target else None
             name = await self._client.blend(job_id, weight, others, (format or PLY).name)
             path = target and str(await self._client.download(job_id, target, name))
-        return Blended(url=self._address(job_id, name), path=path)
+        return {"url": self._address(job_id, name), "path": path}
 
     async def share(
         self,
@@ -194,29 +147,24 @@ class Tools:
         poster: Annotated[
             bool, Field(description="Whether sites where the link is posted can show an image of the result.")
         ] = False,
-    ) -> Link:
+    ) -> dict[str, str | None]:
         """Create a read-only link to the result of a job, for people without a key."""
         with _messages():
             link = await self._client.share(job_id, days, poster=poster)
-        return Link(**{name: link[name] for name in Link.model_fields})
+        return {name: link[name] for name in ("url", "embed_url", "expires_at")}
 
     def _address(self, job_id: str, name: str) -> str:
         return f"{self._client.url}/v1/jobs/{job_id}/artifacts/{name}"
 
-    def _state(self, job: Job) -> State:
+    def _state(self, job: Job) -> dict[str, Any]:
         progress = job.progress or {}
-        return State(
-            job_id=job.id,
-            name=job.data["name"],
-            status=job.status,
-            stage=progress.get("stage"),
-            fraction=progress.get("fraction"),
-            eta_s=progress.get("eta_s"),
-            queue_position=job.data["queue_position"],
-            result=job.data["result"],
-            error=job.error["message"] if job.error else None,
-            page=f"{self._client.url}/#/jobs/{job.id}",
-        )
+        return {
+            "job_id": job.id,
+            **{name: job.data[name] for name in ("name", "status", "queue_position", "result")},
+            **{name: progress.get(name) for name in ("stage", "fraction", "eta_s")},
+            "error": job.error["message"] if job.error else None,
+            "page": f"{self._client.url}/#/jobs/{job.id}",
+        }
 
     def _files(self, scene: str, style: list[str], cameras: str | None, photos: str | None) -> dict[str, Any]:
         """Return the files of a job as arguments of the client, after checking each of them."""
@@ -271,26 +219,17 @@ def _messages() -> Iterator[None]:
         raise ToolError(str(error)) from error
 
 
-def make_server(client: AsyncClient, root: Path) -> MCPServer[None]:
-    """Return the server with its tools, which read and write files below `root`."""
+async def serve(root: Path, url: str | None, key: str | None) -> None:
+    """Serve on standard input and output until the input ends; files are below `root`."""
     server: MCPServer[None] = MCPServer(
         "sgsst", instructions=_INSTRUCTIONS, version=installed_version(), log_level="WARNING"
     )
-    tools = Tools(client, root)
-    server.add_tool(tools.estimate, annotations=_READS)
-    server.add_tool(tools.submit, annotations=_CREATES)
-    server.add_tool(tools.status, annotations=_READS)
-    server.add_tool(tools.result, annotations=_CREATES)
-    server.add_tool(tools.blend, annotations=_CREATES)
-    server.add_tool(tools.share, annotations=_CREATES)
-    return server
-
-
-def serve(root: Path, url: str | None, key: str | None) -> None:
-    """Serve on standard input and output until the input ends; files are below `root`."""
-    anyio.run(_serve, root, url, key)
-
-
-async def _serve(root: Path, url: str | None, key: str | None) -> None:
     async with AsyncClient(url, key) as client:
-        await make_server(client, root).run_stdio_async()
+        tools = Tools(client, root)
+        server.add_tool(tools.estimate, annotations=_READS)
+        server.add_tool(tools.submit, annotations=_CREATES)
+        server.add_tool(tools.status, annotations=_READS)
+        server.add_tool(tools.result, annotations=_CREATES)
+        server.add_tool(tools.blend, annotations=_CREATES)
+        server.add_tool(tools.share, annotations=_CREATES)
+        await server.run_stdio_async()

@@ -5,7 +5,6 @@ Results are compared by benchmarks on one's own scene and machine (`bench`), and
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
-from api.cli.console import error_console, out_console, print_field, spinner
+from api.cli.console import error_console, out_console, print_field
 from api.cli.options import (
     CamerasOption,
     JobArguments,
@@ -35,7 +34,7 @@ from api.cli.options import (
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
-from sgsst_core.progress import clock, duration, job_bar, live_bar
+from sgsst_core.progress import duration, job_bar, live_bar
 from worker.job import JobSpec, Outputs, SceneRequest, check_suffix
 from worker.options import (
     ESSENTIALS,
@@ -48,12 +47,8 @@ from worker.options import (
 )
 
 if TYPE_CHECKING:
-    from api.cli.scene_tools import VariantsRequest
     from sgsst_core.bench.variants import Curve
     from worker.derived import VideoRequest
-
-#: Number of frames after which the time of a video is estimated.
-_TIMED_FRAMES = 6
 
 
 @with_options(StylizeOptions, without=("workers",))
@@ -104,7 +99,7 @@ def check(
     from api.cli.scene_tools import look_for_extremes
 
     source = source_of(scene, cameras, options)
-    with spinner("Checking the scene and every view"):
+    with error_console.status("Checking the scene and every view"):
         findings = look_for_extremes(source, style)
     if not findings:
         out_console.print("No extreme values were found.")
@@ -196,17 +191,7 @@ def _render_video(request: VideoRequest) -> None:
 
     check_video_request(request)
     with _frame_bar() as progress:
-        first: float | None = None
-
-        def show(done: int, total: int) -> None:
-            nonlocal first
-            progress(done, total)
-            first = first or time.monotonic()  # the first frame also compiles kernels
-            if done == min(_TIMED_FRAMES, total) and done > 1:
-                seconds = (time.monotonic() - first) / (done - 1) * total
-                error_console.print(f"Rendering {total} frames, which takes about {clock(seconds)}.")
-
-        cameras = render_video(request, show, _print_warning)
+        cameras = render_video(request, progress, _print_warning)
     frames, fps, size = len(cameras), request.options.fps, f"{cameras[0].width}x{cameras[0].height}"
     out_console.print(f"{frames} frames of {size}, {frames / fps:.3g} s at {fps} per second, in {request.out}")
 
@@ -308,7 +293,7 @@ def view(
     if len({*names}) < len(names) or len(names) > MOST_VIEWPOINTS:
         raise SettingsError(f"--views {views}: must be at most {MOST_VIEWPOINTS} names, each of them once.")
     source = SceneRequest.of(scene, cameras, options)
-    with spinner("Compressing the scene"):
+    with error_console.status("Compressing the scene"):
         file, _ = read_requested(source)
         before = None if original is None else read_requested(source.model_copy(update={"scene": original}))[0]
         capture = None if cameras is None else read_capture(source, file.scene)
@@ -409,7 +394,7 @@ def paint(
 
 #: Options of a job that apply to all variants.
 _OF_VARIANTS = ("coarsest_side", "background", "backbone", "memory_limit", "seed")
-#: Width in characters of tables that a narrower terminal would truncate.
+#: Width in characters of a table that a narrower terminal would truncate.
 _TABLE_WIDTH = 180
 
 bench_app = typer.Typer(help="Benchmarks for your own scene and machine.", no_args_is_help=True)
@@ -424,15 +409,6 @@ class VariantsInputs:
     cameras: CamerasOption = None
     seconds: Annotated[float, typer.Option(min=1, max=1e6, help="Seconds of optimization per variant.")] = 300.0
 
-    def request(self, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path) -> VariantsRequest:
-        """Return the request for these variants, which are separated by commas."""
-        from api.cli.scene_tools import VariantsRequest
-
-        source = source_of(self.scene, self.cameras, options)
-        settings = {**chosen.given_settings(), "near": options.near}
-        names = [name.strip() for name in variants.split(",") if name.strip()]
-        return VariantsRequest(source, self.style, out, names, self.seconds, chosen.backbone, settings)
-
 
 @bench_app.command("error-time")
 @with_options(ViewOptions)
@@ -440,20 +416,18 @@ class VariantsInputs:
 @with_arguments(VariantsInputs)
 def error_time(
     inputs: VariantsInputs,
-    out: Annotated[
-        Path, typer.Option(help="Folder for table, plot, JSON and scenes.", callback=folder_to_write)
-    ] = Path("error_time"),
+    out: Annotated[Path, typer.Option(help="Folder for plot, JSON and scenes.", callback=folder_to_write)] = Path(
+        "error_time"
+    ),
     variants: Annotated[str, typer.Option(help="Names of variants, separated by commas. [default: all]")] = "",
     *,
     options: ViewOptions,
     chosen: StylizeOptions,
 ) -> None:
     """Run variants of a job for the same time each, and plot the remaining error against time."""
-    from api.cli.scene_tools import error_time_table, point_line, run_error_time
+    from api.cli.scene_tools import point_line, run_error_time
 
-    request = inputs.request(options, chosen, variants, out)
-    curves = run_error_time(request, lambda curve: error_console.print(point_line(curve)))
-    Console(width=_TABLE_WIDTH).print(error_time_table(curves))
+    curves = run_error_time(inputs, options, chosen, variants, out, lambda curve: out_console.print(point_line(curve)))
     _print_skipped_variants(curves, out)
 
 
@@ -476,8 +450,7 @@ def quality(
     """Run variants of a job for the same time each, and judge results with a network that none of them optimizes."""
     from api.cli.scene_tools import point_line, quality_table, run_quality
 
-    request = inputs.request(options, chosen, variants, out)
-    quality = run_quality(request, lambda curve: error_console.print(point_line(curve)))
+    quality = run_quality(inputs, options, chosen, variants, out, lambda curve: error_console.print(point_line(curve)))
     Console(width=_TABLE_WIDTH).print(quality_table(quality))
     _print_skipped_variants(quality.curves, out)
 
@@ -519,7 +492,7 @@ def make(
     source = source_of(named(variants[0])[1], cameras, options)
     if options.views is None and options.orbit is None:
         source = source.model_copy(update={"views": _VIEWS})
-    with spinner("Rendering the views"):
+    with error_console.status("Rendering the views"):
         make_study(variants, source, style, chosen.settings().background, out)
     print_field("page", out)
     print_field("key", key_path(out))

@@ -7,16 +7,15 @@ The functions check all inputs, compute, and write the outputs, but print nothin
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rich.table import Column, Table
 from torch import Tensor
 
-from api.cli.options import local_path
+from api.cli.options import local_path, source_of
 from api.static_files import FOLDER
 from sgsst_core.devices import seconds_left
 from sgsst_core.errors import SettingsError
@@ -38,25 +37,18 @@ from worker.derived import blend
 from worker.execute import dry_run
 from worker.inputs import check_something_seen, orbit_request, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice, check_is_not_input, check_suffix
-from worker.options import ViewOptions, split_weight
+from worker.options import StylizeOptions, ViewOptions, split_weight
 from worker.painting import camera_named
 
-if TYPE_CHECKING:  # it imports matplotlib, for which the other commands need not wait
+if TYPE_CHECKING:  # the second one imports matplotlib, for which the other commands need not wait
+    from api.cli.scene_commands import VariantsInputs
     from sgsst_core.bench.variants import Curve, Quality
 
 # --- demo ----------------------------------------------------------------------------------------------------------
 
 
-class DemoScene(NamedTuple):
-    """Files of the demo: a 3DGS PLY of SH degree 0, its views as an INRIA cameras.json, and a style image."""
-
-    ply: Path
-    cameras: Path
-    style: Path
-
-
-def build_demo(folder: Path) -> DemoScene:
-    """Write the demo's scene, cameras and style image into a folder, and create the folder.
+def build_demo(folder: Path) -> tuple[Path, Path, Path]:
+    """Create a folder, write a 3DGS PLY of SH degree 0, its views as an INRIA cameras.json, and a style image.
 
     The scene is the example of the page. It was lifted from the stereo pair Motorcycle of the Middlebury 2014 benchmark
     (Scharstein et al., "High-resolution stereo datasets with subpixel-accurate ground truth", GCPR 2014): every pixel
@@ -66,13 +58,13 @@ def build_demo(folder: Path) -> DemoScene:
         OutputError: If the folder cannot be written.
     """
     ensure_writable_folder(folder)
-    demo = DemoScene(folder / "motorcycle.ply", folder / "cameras.json", folder / "starry_night.jpg")
+    ply, cameras, style = (folder / name for name in ("motorcycle.ply", "cameras.json", "starry_night.jpg"))
     example = FOLDER / "example"
-    write_scene(demo.ply, read_scene(example / "motorcycle.sog").scene)
-    for source, target in ((example / "cameras.json", demo.cameras), (STARRY_NIGHT, demo.style)):
+    write_scene(ply, read_scene(example / "motorcycle.sog").scene)
+    for source, target in ((example / "cameras.json", cameras), (STARRY_NIGHT, style)):
         with atomic_path(target) as temporary:
             temporary.write_bytes(source.read_bytes())
-    return demo
+    return ply, cameras, style
 
 
 # --- plan ----------------------------------------------------------------------------------------------------------
@@ -100,8 +92,11 @@ def make_plan(
         check_is_not_input(out, source.cameras, "camera file")
     if sheet is not None:
         check_suffix(sheet, "a JPEG file", "views.jpg")
-        for path, description in _input_images(request):
-            check_is_not_input(sheet, path, description)
+        folders = [each.selection.path for each in request.regions if each.selection and each.selection.kind == "masks"]
+        images = [path for folder in (*folders, request.images) if folder for path in folder.rglob("*")]
+        images += [each.path for styles in (request.styles, *(r.styles for r in request.regions)) for each in styles]
+        for path in images:
+            check_is_not_input(sheet, path, "image of a style, mask or photo")
     inputs = read_inputs(request)
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
@@ -111,17 +106,6 @@ def make_plan(
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan := plan_json(job))
     return plan
-
-
-def _input_images(request: JobSpec) -> Iterator[tuple[Path, str]]:
-    """Yield the path and the description of each image that a job may read."""
-    for style in (*request.styles, *(each for region in request.regions for each in region.styles)):
-        yield style.path, "style image"
-    for region in request.regions:
-        if region.selection and region.selection.kind == "masks" and region.selection.path:
-            yield from ((path, "mask") for path in region.selection.path.rglob("*"))
-    if request.images:
-        yield from ((path, "photo") for path in request.images.rglob("*"))
 
 
 # --- check ---------------------------------------------------------------------------------------------------------
@@ -268,64 +252,48 @@ def blend_files(
 # --- bench -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class VariantsRequest:
-    """Request of `sgsst bench error-time` or `sgsst bench quality`.
+def _read_variants(
+    inputs: VariantsInputs, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path
+) -> tuple[SceneFile, dict[str, Any], dict[str, Any]]:
+    """Check and read the files of a comparison of variants; the quick checks come first.
 
-    Attributes:
-        out: Folder for table, plot, JSON and scenes.
-        variants: Names of variants; empty for all.
-        seconds: Seconds of optimization per variant.
-        backbone: "auto", "vgg19" or "vgg16".
-        settings: Settings of all variants, on top of the standard preset.
-    """
-
-    source: SceneRequest
-    style: Path
-    out: Path
-    variants: Sequence[str]
-    seconds: float
-    backbone: str
-    settings: dict[str, Any]
-
-    @property
-    def title(self) -> str:
-        """Scene and style, for titles of plots."""
-        return f"{self.source.scene.parent.name or self.source.scene.stem}, {self.style.stem}"
-
-
-def _read_variants(request: VariantsRequest) -> tuple[SceneFile, dict[str, Any], dict[str, Any]]:
-    """Check and read the files of a request; the quick checks come first.
+    Args:
+        chosen: Options of all variants, on top of the standard preset.
+        variants: Names of variants, separated by commas; empty for all.
+        out: Folder for plots, JSON and scenes.
 
     Returns:
-        The scene's file, the arguments of `error_time` besides `progress`, and the request as a JSON object.
+        The scene's file, the arguments of `error_time` besides `progress`, and the comparison as a JSON object.
     """
     from sgsst_core.bench.variants import choose_variants
 
-    variants = choose_variants(request.variants)
-    weights = load_network_weights(request.backbone)
-    style = load_image(request.style)
-    file, capture = read_scene_and_capture(request.source)
-    ensure_writable_folder(request.out)
-    read = {"scene": file.scene, "cameras": capture.cameras, "style": style, "variants": variants, "weights": weights}
+    compared = choose_variants([name.strip() for name in variants.split(",") if name.strip()])
+    weights = load_network_weights(chosen.backbone)
+    style = load_image(inputs.style)
+    file, capture = read_scene_and_capture(source_of(inputs.scene, inputs.cameras, options))
+    ensure_writable_folder(out)
+    settings = {**chosen.given_settings(), "near": options.near}
+    read = {"scene": file.scene, "cameras": capture.cameras, "style": style, "variants": compared, "weights": weights}
     described = {
         "version": 1,
-        "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
-        "style": request.style.name,
+        "scene": inputs.scene.parent.name + "/" + inputs.scene.name,
+        "style": inputs.style.name,
         "views": len(capture.cameras),
         "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in capture.cameras})],
-        "budget_seconds": request.seconds,
-        "settings": request.settings,
+        "budget_seconds": inputs.seconds,
+        "settings": settings,
         "backbone": weights.name,
         "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
     }
-    return file, {**read, "seconds": request.seconds, **request.settings}, described
+    return file, {**read, "seconds": inputs.seconds, **settings}, described
 
 
-def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
+def run_error_time(
+    inputs: VariantsInputs, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path, progress: Any
+) -> list[Curve]:
     """Run the variants, and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
 
-    The JSON file is written after each evaluation, so that an interrupted run leaves what it has measured.
+    The other arguments are those of `_read_variants`.
 
     Args:
         progress: Callback that receives a curve after each of its evaluations.
@@ -335,41 +303,33 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
     """
     from sgsst_core.bench.variants import as_dict, error_time, write_plot
 
-    file, arguments, described = _read_variants(request)
-    measured: dict[str, Curve] = {}
-
-    def write(curves: Sequence[Curve]) -> None:
-        write_json(request.out / "error_time.json", {**described, **as_dict(curves)})
-
-    def evaluated(curve: Curve) -> None:
-        measured[curve.variant.name] = curve
-        write(list(measured.values()))
-        progress(curve)
-
-    curves = error_time(**arguments, progress=evaluated)
-    write(curves)
-    write_plot(request.out / "error_time.png", curves, request.title)
+    file, arguments, described = _read_variants(inputs, options, chosen, variants, out)
+    curves = error_time(**arguments, progress=progress)
+    write_json(out / "error_time.json", {**described, **as_dict(curves)})
+    write_plot(out / "error_time.png", curves, f"{described['scene']}, {described['style']}")
     for curve in curves:
         if curve.sh_dc is not None:
-            write_stylized(file, request.out / f"{curve.variant.name}.ply", curve.sh_dc)
+            write_stylized(file, out / f"{curve.variant.name}.ply", curve.sh_dc)
     return curves
 
 
-def run_quality(request: VariantsRequest, progress: Any) -> Quality:
+def run_quality(
+    inputs: VariantsInputs, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path, progress: Any
+) -> Quality:
     """Run the variants, measure their quality, and write `quality.json`, plots, `quality.jpg` and scenes.
 
     Arguments and errors are those of `run_error_time`.
     """
     from sgsst_core.bench.variants import compare_quality, write_plot, write_quality_plot, write_sheet
 
-    file, arguments, described = _read_variants(request)
+    file, arguments, described = _read_variants(inputs, options, chosen, variants, out)
     quality = compare_quality(**arguments, progress=progress)
-    write_json(request.out / "quality.json", {**described, **quality.as_dict()})
-    write_quality_plot(request.out / "quality.png", quality, request.title)
-    write_plot(request.out / "error_time.png", quality.curves, request.title)
-    write_sheet(request.out / "quality.jpg", quality)
+    write_json(out / "quality.json", {**described, **quality.as_dict()})
+    write_quality_plot(out / "quality.png", quality, f"{described['scene']}, {described['style']}")
+    write_plot(out / "error_time.png", quality.curves, f"{described['scene']}, {described['style']}")
+    write_sheet(out / "quality.jpg", quality)
     for outcome in quality.outcomes[1:]:
-        write_stylized(file, request.out / f"{outcome.name}.ply", outcome.sh_dc)
+        write_stylized(file, out / f"{outcome.name}.ply", outcome.sh_dc)
     return quality
 
 
@@ -402,31 +362,6 @@ def quality_table(quality: Quality) -> Table:
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
-
-
-def error_time_table(curves: Sequence[Curve]) -> Table:
-    """Return a table of each variant's remaining loss over time, and of its final loss by scale and judgment."""
-    shown = [curve for curve in curves if curve.points]
-    scales = sorted({scale for curve in shown for scale in curve.points[-1].by_scale})
-    moments = [f"{point.seconds:.0f} s" for point in shown[0].points] if shown else []
-    table = Table(
-        Column("variant", no_wrap=True),
-        *moments,
-        *(f"scale {scale}" for scale in scales),
-        "style",
-        "color_distance",
-        "steps",
-        title="remaining loss, relative to the start, and judgment of the end",
-    )
-    for curve in curves:
-        if not curve.points:
-            continue
-        losses = [_number(point.relative) for point in curve.points]
-        end = curve.points[-1]
-        ends = [end.by_scale[scale] for scale in scales]
-        judged = [end.judgment.style, end.judgment.color_distance] if end.judgment else [None, None]
-        table.add_row(curve.variant.name, *losses, *(_number(value) for value in (*ends, *judged)), str(end.step))
-    return table
 
 
 def point_line(curve: Curve) -> str:

@@ -23,10 +23,8 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 #: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
 TRIES = 6
 
-#: Variables of the environment that name proxies, and hosts to reach without them.
-_PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY")
-#: Variables that name files for encrypted connections.
-_CERTIFICATES = ("SSL_CERT_FILE", "SSLKEYLOGFILE")
+#: Variables of the environment that name proxies, hosts to reach without them, and files for encrypted connections.
+_ENVIRONMENT = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY", "SSL_CERT_FILE", "SSLKEYLOGFILE")
 #: Methods of requests that change nothing.
 _READS = ("GET", "HEAD")
 
@@ -39,93 +37,6 @@ BLOCK = 1 << 20
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 T = TypeVar("T")
-
-
-class Download:
-    """Protocol of one download to a target path, for `Transport.fetch`.
-
-    A partial file is resumed, also that of an earlier process: its name has the SHA-256 of the complete file, by which
-    that is checked.
-
-    Attributes:
-        path: Path of the file on the service.
-    """
-
-    def __init__(self, path: str, target: Path, progress: Progress) -> None:
-        self.path = path
-        self._target, self._progress = target, progress
-        self._expected = ""
-        self._done = self._size = 0
-
-    @property
-    def _part(self) -> Path:
-        return temporary_path(self._target, self._expected)
-
-    def headers(self) -> dict[str, str]:
-        """Return headers that resume the partial file, if there is one, and that keep proxies from compressing."""
-        for path in self._target.parent.glob(temporary_path(self._target, "*").name):
-            if (stated := _SHA256.search(path.name)) and path.is_file() and not path.is_symlink():
-                self._expected, self._done = stated[0], path.stat().st_size
-                tag = f'"{self._expected}"'
-                return {"Accept-Encoding": "identity", "Range": f"bytes={self._done}-", "If-Range": tag}
-        return {"Accept-Encoding": "identity"}
-
-    def begin(self, response: httpx2.Response) -> bool:
-        """Process the headers of a successful response, or of status 416, which means that all bytes were received.
-
-        Returns:
-            Whether the response's body must be written.
-
-        Raises:
-            ApiError: If the response does not state the SHA-256 of the file.
-            OutputError: If the disk is full.
-        """
-        if response.status_code == httpx2.codes.RANGE_NOT_SATISFIABLE:
-            return False
-        stated = _SHA256.search(response.headers.get("etag", ""))
-        if stated is None:
-            raise ApiError(
-                f"{response.url}: has no SHA-256 as its ETag, so the file cannot be checked. Check the address, and "
-                "which headers a proxy removes."
-            )
-        if response.status_code != httpx2.codes.PARTIAL_CONTENT:
-            self.discard()
-            self._done = 0
-            self._expected = stated[0]
-            with disk_errors(self._target):
-                self._part.open("xb").close()
-        self._size = self._done + int(response.headers.get("content-length", 0))
-        return True
-
-    def write(self, block: bytes) -> None:
-        """Append a block to the partial file.
-
-        Raises:
-            OutputError: If the disk is full.
-        """
-        with disk_errors(self._target), self._part.open("ab") as file:
-            file.write(block)
-        self._done += len(block)
-
-    def report(self) -> None:
-        """Report the progress."""
-        self._progress(self._done, self._size)
-
-    def finish(self) -> None:
-        """Check the whole file, then rename it to its target.
-
-        Raises:
-            ApiError: If the SHA-256 differs from the service's. The partial file is then deleted.
-            OutputError: If another program holds the target open.
-        """
-        if file_digest(self._part) != self._expected:
-            self.discard()
-            raise ApiError(f"{self.path}: the download was damaged in transit. Try again.", 460)
-        replace(self._part, self._target)
-
-    def discard(self) -> None:
-        """Delete the partial file."""
-        self._part.unlink(missing_ok=True)
 
 
 class Transport:
@@ -192,60 +103,58 @@ class Transport:
         json_text(options.get("json"))
         result: dict[str, Any] = {}
 
-        def take(event: httpx2.ServerSentEvent) -> None:
-            if not event.data:
-                return
-            data = json.loads(event.data)
-            if event.event == step:
-                if data["total"]:  # stages of unknown length have no steps
-                    progress(data["step"], data["total"])
-            elif event.event == "problem":
-                raise refusal(data["detail"], data["status"], data)
-            else:
-                result.update(data)
-
         async def once() -> None:
             async with self.http.sse(path, method="POST", **options) as source:
                 self.reached = True
-                if source.response.headers.get("content-type", "").startswith("text/event-stream"):
-                    async for event in source:
-                        take(event)
-                else:
+                if not source.response.headers.get("content-type", "").startswith("text/event-stream"):
                     await source.response.aread()
                     result.update(checked(source.response).json())
+                    return
+                async for event in source:
+                    data = json.loads(event.data or "{}")  # messages without data only keep the connection alive
+                    if event.event == "problem":
+                        raise refusal(data["detail"], data["status"], data)
+                    if event.event != step:
+                        result.update(data)
+                    elif data["total"]:  # stages of unknown length have no steps
+                        progress(data["step"], data["total"])
 
         await self._retry(once)
         if not result:  # the service was stopped, or a proxy cut the response off
             raise ApiError("The connection ended before the result arrived. Try again.", 502)
         return result
 
-    async def fetch(self, download: Download) -> None:
-        """Download a file; a broken download is resumed.
+    async def fetch(self, path: str, target: Path, progress: Progress) -> None:
+        """Download a file, and check its SHA-256. A broken download is resumed, also that of an earlier process.
+
+        The name of the partial file has the SHA-256 of the complete one.
 
         Raises:
-            RequestError, ApiError: As for `call`.
-            OutputError: If the disk is full. Nothing of the file remains.
+            RequestError, ApiError: As for `call`, or if the response does not state the SHA-256, or has another one.
+            OutputError: If the disk is full, and nothing of the file remains; or another program holds the target open.
         """
 
         async def once() -> None:
-            headers = await in_thread(download.headers)
-            async with self.http.stream("GET", download.path, headers=headers) as response:
+            digest, done = await in_thread(_partial_file, target)
+            headers = {"Accept-Encoding": "identity"}  # keeps proxies from compressing
+            if digest:
+                headers |= {"Range": f"bytes={done}-", "If-Range": f'"{digest}"'}
+            async with self.http.stream("GET", path, headers=headers) as response:
                 self.reached = True
-                # Status 416 means that all bytes were received before.
-                if response.is_error and response.status_code != httpx2.codes.RANGE_NOT_SATISFIABLE:
-                    await response.aread()
-                    checked(response)
-                if await in_thread(download.begin, response):
+                if response.status_code != httpx2.codes.RANGE_NOT_SATISFIABLE:  # else all bytes were received before
+                    if response.is_error:
+                        await response.aread()
+                        checked(response)
+                    if response.status_code != httpx2.codes.PARTIAL_CONTENT:
+                        digest, done = await in_thread(_start_file, target, digest, response), 0
+                    size = done + int(response.headers.get("content-length", 0))
                     async for block in response.aiter_bytes(BLOCK):
-                        await in_thread(download.write, block)
-                        download.report()
-            await in_thread(download.finish)
+                        await in_thread(_append, target, digest, block)
+                        done += len(block)
+                        progress(done, size)
+            await in_thread(_finish_file, path, target, digest)
 
-        try:
-            await self._retry(once, reading=True)
-        except OutputError:
-            await in_thread(download.discard)
-            raise
+        await self._retry(once, reading=True)
 
     def gives_up(self, error: Exception) -> bool:
         """Return whether a read error means that there is no service, rather than that it is restarting."""
@@ -254,7 +163,8 @@ class Transport:
     def unreachable(self, error: Exception) -> ApiError:
         """Return the error for a service that did not respond."""
         proxy = _proxy_for(self.url)
-        through = f" through the proxy {_without_password(proxy)} (NO_PROXY excludes hosts)" if proxy else ""
+        named = proxy and httpx2.URL(proxy).copy_with(userinfo=b"")
+        through = f" through the proxy {named} (NO_PROXY excludes hosts)" if proxy else ""
         return ApiError(
             f"{self.url} cannot be reached{through}: {error}. Is `sgsst serve` running? --url names another address."
         )
@@ -267,6 +177,49 @@ class Transport:
             return await self._retrying(may_pass, once)
         except httpx2.TransportError as error:
             raise self.unreachable(error) from None
+
+
+def _partial_file(target: Path) -> tuple[str, int]:
+    """Return the SHA-256 in the name of a file's partial download, and its size; an empty text if there is none."""
+    for path in target.parent.glob(temporary_path(target, "*").name):
+        if (stated := _SHA256.search(path.name)) and path.is_file() and not path.is_symlink():
+            return stated[0], path.stat().st_size
+    return "", 0
+
+
+def _start_file(target: Path, old: str, response: httpx2.Response) -> str:
+    """Create the partial file of a download in place of an older one, and return the SHA-256 of the whole file."""
+    stated = _SHA256.search(response.headers.get("etag", ""))
+    if stated is None:
+        raise ApiError(
+            f"{response.url}: has no SHA-256 as its ETag, so the file cannot be checked. Check the address, and which "
+            "headers a proxy removes."
+        )
+    temporary_path(target, old).unlink(missing_ok=True)
+    part = temporary_path(target, stated[0])
+    with disk_errors(target):
+        part.open("xb").close()
+    return stated[0]
+
+
+def _append(target: Path, digest: str, block: bytes) -> None:
+    """Append a block to a partial file, which is deleted if the disk is full."""
+    part = temporary_path(target, digest)
+    try:
+        with disk_errors(target), part.open("ab") as file:
+            file.write(block)
+    except OutputError:
+        part.unlink()
+        raise
+
+
+def _finish_file(path: str, target: Path, digest: str) -> None:
+    """Check a whole file, then rename it to its target; a damaged one is deleted."""
+    part = temporary_path(target, digest)
+    if file_digest(part) != digest:
+        part.unlink()
+        raise ApiError(f"{path}: the download was damaged in transit. Try again.", 460)
+    replace(part, target)
 
 
 def _is_address(url: str) -> bool:
@@ -288,13 +241,11 @@ def _http_client(url: str, headers: dict[str, str]) -> httpx2.AsyncClient:
     try:
         proxy = _proxy_for(url)
         if proxy.startswith("http") and not _is_address(proxy):
-            raise ValueError(f"{_without_password(proxy)} is no address")
+            raise ValueError("the proxy has no address that is possible")
         return httpx2.AsyncClient(base_url=url, headers=headers, timeout=httpx2.Timeout(30.0, read=900.0, write=120.0))
     except Exception as error:  # httpx2 raises errors of many types here, some of them built-in
-        names = _CERTIFICATES if isinstance(error, OSError) else _PROXIES
-        given = {name: value for name, value in sorted(os.environ.items()) if name.upper() in names and value}
-        shown = " or ".join(f"{name}={_without_password(value)}" for name, value in given.items())
-        raise RequestError(f"{shown} cannot be used: {str(error).rstrip('.')}. Correct or unset it.") from error
+        given = " or ".join(name for name in sorted(os.environ) if name.upper() in _ENVIRONMENT and os.environ[name])
+        raise RequestError(f"{given} cannot be used: {str(error).rstrip('.')}. Correct or unset it.") from error
 
 
 def _proxy_for(url: str) -> str:
@@ -304,11 +255,6 @@ def _proxy_for(url: str) -> str:
     if not proxy or urllib.request.proxy_bypass(parsed.host):
         return ""
     return proxy if "://" in proxy else f"http://{proxy}"
-
-
-def _without_password(address: str) -> str:
-    """Return the address of a proxy without its user and password."""
-    return re.sub(r"^(\w+://)?.*@", r"\1", address)
 
 
 def json_text(value: object) -> str:
@@ -382,11 +328,6 @@ class Event:
     id: int
     kind: str
     data: Mapping[str, Any]
-
-    @staticmethod
-    def of(event: httpx2.ServerSentEvent) -> Event:
-        """Return the event from the service's stream."""
-        return Event(int(event.id or 0), event.event, json.loads(event.data))
 
 
 def checked(response: httpx2.Response) -> httpx2.Response:

@@ -14,21 +14,20 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
-import anyio
 import anyio.to_thread
 from fastapi import FastAPI
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from api import installed_version
-from api.http import jobs, monitoring, sessions, shares, submission, uploads
+from api.http import access, jobs, monitoring, submission
 from api.http.context import Context, Rates
-from api.http.events import Hub
+from api.http.jobs import Hub
 from api.http.monitoring import Metrics, Readiness
 from api.http.problems import (
+    HANDLERS,
     METHODS,
     Problem,
-    add_handlers,
     complete,
     from_service,
     logged_path,
@@ -37,8 +36,7 @@ from api.http.problems import (
 )
 from api.http.receiving import Fetcher, Receipts
 from api.http.schemas import ANSWERS, path_of, subpath
-from api.http.sessions import SignIns
-from api.http.static import add_static
+from api.http.sending import add_static
 from api.http.submission import JobFromUploads
 from service import problems
 from service.deadlines import Deadline, FileThreads, OwnerLimit
@@ -83,7 +81,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             inspector=inspector,
             derived=DerivedFiles(settings, store, blobs, results, threads, inspector.processes),
             hub=Hub(store),
-            sign_ins=SignIns(),
+            sign_ins=Rates(),
             rates=Rates(),
             receipts=Receipts(store.inputs, blobs, threads),
             threads=threads,
@@ -103,8 +101,6 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
         # Most of these threads wait; the default executor has few of them on machines with few processors.
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
-        context.hub.start()
-        context.receipts.start()
         with suppress(DamagedWeightsError):  # the error is logged, and /readyz reports it
             await asyncio.to_thread(check_weights)
         yield
@@ -123,16 +119,16 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
         docs_url=None,  # FastAPI's own page loads its script from a CDN
         redoc_url=None,
+        exception_handlers=HANDLERS,
     )
     app.settings = settings
     routers = [
-        *(submission.router, jobs.router, jobs.inputs_router, jobs.artifacts_router, shares.router),
-        *(uploads.router, sessions.router, monitoring.router),
+        *(submission.router, jobs.router, jobs.inputs_router, jobs.artifacts_router, access.router),
+        *(submission.uploads_router, access.session_router, monitoring.router),
     ]
     for router in routers:
         app.include_router(router)
     add_static(app)
-    add_handlers(app)
     app.add_middleware(Deadlines, seconds=settings.answer_seconds)
 
     plain = app.openapi
@@ -154,8 +150,7 @@ class _App(FastAPI):
 
     def build_middleware_stack(self) -> ASGIApp:
         """Return the app with all middleware."""
-        inner = Methods(super().build_middleware_stack())
-        return Observed(Proxied(inner, self.settings), self.state)
+        return Observed(Adapted(super().build_middleware_stack(), self.settings), self.state)
 
 
 #: Path of the uploads, whose protocol lets a header replace the method, for clients that can only send GET and POST.
@@ -184,14 +179,11 @@ class Observed:
         request: Scope = {**scope, "request_id": request_id}  # other middleware changes the copy, not the server's
         status = 0
 
-        def note(new_status: int) -> None:
-            nonlocal status
-            status = new_status
-            self._note(scope["method"], request, status, time.perf_counter() - started)
-
         async def observed(message: Message) -> None:
+            nonlocal status
             if message["type"] == "http.response.start":
-                note(message["status"])
+                status = message["status"]
+                self._note(scope["method"], request, status, time.perf_counter() - started)
                 message = {**message, "headers": [*message["headers"], (b"x-request-id", request_id.encode())]}
             await send(message)
 
@@ -202,7 +194,7 @@ class Observed:
                 await from_service(problems.STOPPING())(request, receive, observed)
         except BaseException:
             if status < 500:
-                note(500)
+                self._note(scope["method"], request, 500, time.perf_counter() - started)
             raise
 
     def _note(self, method: str, request: Scope, status: int, seconds: float) -> None:
@@ -212,10 +204,13 @@ class Observed:
         _access.info("request", extra={**extra, "request_id": request["request_id"]})
 
 
-class Proxied:
+class Adapted:
     """Middleware that takes the client's address, the scheme and the subpath of a request from a trusted proxy.
 
     The proxy may pass the subpath on or strip it. A subpath in the settings replaces the proxy's.
+
+    It also chooses the method by which the routes answer. HEAD is answered wherever GET is: with the same headers, and
+    without the body.
     """
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
@@ -230,6 +225,10 @@ class Proxied:
             scope["root_path"] = root
             if not f"{scope['path']}/".startswith(f"{root}/"):
                 scope["path"] = root + scope["path"]
+            if f"{path_of(scope)}/".startswith(f"{_UPLOADS}/"):
+                scope["method"] = _header(scope, b"x-http-method-override") or scope["method"]
+            if scope["method"] == "HEAD" and "GET" in (routed := routed_methods(scope)) and "HEAD" not in routed:
+                scope["method"], send = "GET", _head_of(send)
         await self._app(scope, receive, send)  # type: ignore[arg-type]
 
     def _forwarded(self, scope: Scope) -> str:
@@ -239,25 +238,6 @@ class Proxied:
             return ""
         prefix = _header(scope, b"x-forwarded-prefix").rstrip("/")
         return prefix if is_subpath(prefix) else ""
-
-
-class Methods:
-    """Middleware that chooses the method by which the routes answer a request.
-
-    HEAD is answered wherever GET is: with the same headers, and without the body.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request."""
-        if scope["type"] == "http":
-            if f"{path_of(scope)}/".startswith(f"{_UPLOADS}/"):
-                scope["method"] = _header(scope, b"x-http-method-override") or scope["method"]
-            if scope["method"] == "HEAD" and "GET" in (routed := routed_methods(scope)) and "HEAD" not in routed:
-                scope["method"], send = "GET", _head_of(send)
-        await self._app(scope, receive, send)
 
 
 class Deadlines:
@@ -279,61 +259,47 @@ class Deadlines:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        await _Exchange(self._app, self._seconds, scope, receive, send).run()
+        complete = started = over = False
+        expired: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        deadline, cancel = Deadline(self._seconds, lambda: expired.set_result(None)), anyio.CancelScope()
 
+        async def from_client() -> Message:
+            nonlocal complete
+            if complete:  # the app waits for the client to leave
+                return await receive()
+            with deadline.suspended():
+                message = await receive()
+            complete = not message.get("more_body", False)
+            return message
 
-class _Exchange:
-    """Request and its response."""
+        async def to_client(message: Message) -> None:
+            nonlocal started
+            if over:
+                return
+            started = True
+            with deadline.suspended():
+                await send(message)
 
-    def __init__(self, app: ASGIApp, seconds: float, scope: Scope, receive: Receive, send: Send) -> None:
-        self._app, self._seconds, self._scope = app, seconds, scope
-        self._from_client, self._to_client = receive, send
-        self._complete = self._started = self._over = False
-        self._cancel = anyio.CancelScope()
-        self._expired = asyncio.get_running_loop().create_future()
+        async def serve() -> None:
+            with cancel:
+                await self._app(scope, from_client, to_client)
 
-    async def run(self) -> None:
-        self._deadline = Deadline(self._seconds, lambda: self._expired.set_result(None))
-        serving = asyncio.create_task(self._serve())
+        serving = asyncio.create_task(serve())
         try:
-            await asyncio.wait((serving, self._expired), return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait((serving, expired), return_when=asyncio.FIRST_COMPLETED)
             if serving.done():
                 await serving
-            else:
-                await self._expire(serving)
-        finally:
-            self._deadline.close()
-            self._cancel.cancel()
-
-    async def _serve(self) -> None:
-        with self._cancel:
-            await self._app(self._scope, self._receive, self._send)
-
-    async def _expire(self, serving: asyncio.Task[None]) -> None:
-        """Give the request up, and answer it if no response has started; otherwise the server closes the connection."""
-        self._over = True
-        serving.add_done_callback(lambda task: task.cancelled() or task.exception())  # it ends without an audience
-        method, path = self._scope["method"], logged_path(self._scope)
-        _log.warning("no progress for %g s, request given up: %s %s", self._seconds, method, path)
-        if not self._started:
-            await from_service(problems.DEADLINE_EXCEEDED(seconds=self._seconds))(
-                self._scope, self._from_client, self._to_client
+                return
+            over = True
+            serving.add_done_callback(lambda task: task.cancelled() or task.exception())  # it ends without an audience
+            _log.warning(
+                "no progress for %g s, request given up: %s %s", self._seconds, scope["method"], logged_path(scope)
             )
-
-    async def _receive(self) -> Message:
-        if self._complete:  # the app waits for the client to leave
-            return await self._from_client()
-        with self._deadline.suspended():
-            message = await self._from_client()
-        self._complete = not message.get("more_body", False)
-        return message
-
-    async def _send(self, message: Message) -> None:
-        if self._over:
-            return
-        self._started = True
-        with self._deadline.suspended():
-            await self._to_client(message)
+            if not started:  # otherwise the server closes the connection
+                await from_service(problems.DEADLINE_EXCEEDED(seconds=self._seconds))(scope, receive, send)
+        finally:
+            deadline.close()
+            cancel.cancel()
 
 
 def _head_of(send: Send) -> Send:

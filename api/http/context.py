@@ -18,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated
-from urllib.parse import urlsplit
 
 from fastapi import Depends, Request
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
@@ -32,10 +31,9 @@ from service.store.keys import NO_QUOTAS, Quotas
 from service.store.tables import KeyRow
 
 if TYPE_CHECKING:
-    from api.http.events import Hub
+    from api.http.jobs import Hub
     from api.http.monitoring import Metrics, Readiness
     from api.http.receiving import Fetcher, Receipts
-    from api.http.sessions import SignIns
     from service.deadlines import FileThreads, OwnerLimit
     from service.files.blobs import Blobs
     from service.files.objects import Artifacts
@@ -68,7 +66,7 @@ class Context:
     hub: Hub
     metrics: Metrics
     readiness: Readiness
-    sign_ins: SignIns
+    sign_ins: Rates
     rates: Rates
     receipts: Receipts
     threads: FileThreads
@@ -167,7 +165,7 @@ def check_origin(request: Request, *, required: bool = True) -> None:
         CROSS_ORIGIN: If the request comes from another origin, or lacks required headers.
     """
     origin, site = request.headers.get("origin"), request.headers.get("sec-fetch-site")
-    if origin is not None and _netloc(origin) != request.headers.get("host"):
+    if origin is not None and origin.partition("://")[2] != request.headers.get("host"):
         raise problems.CROSS_ORIGIN(f"Pages of {origin[:100]!r} may not use the sessions of this service.")
     if site is not None and site != "same-origin":
         raise problems.CROSS_ORIGIN("Pages of other sites may not use the sessions of this service.")
@@ -194,15 +192,8 @@ def check_site(request: Request, settings: ServiceSettings) -> None:
             f"The service accepts requests from this machine only, and {host[:100]!r} is not one of its names."
         )
     origin = request.headers.get("origin")
-    if origin is not None and _netloc(origin) != request.headers.get("host"):
+    if origin is not None and origin.partition("://")[2] != request.headers.get("host"):
         raise problems.FOREIGN_SITE(f"Pages of {origin!r} may not use this service without an API key.")
-
-
-def _netloc(origin: str) -> str:
-    try:
-        return urlsplit(origin).netloc
-    except ValueError:  # For example "http://[", which no browser sends.
-        return ""
 
 
 _ID = re.compile(r"[a-z]{3}_[0-9a-f]{8,36}")
@@ -283,19 +274,20 @@ class Rates:
         self._clock = clock
         self._left: dict[str, tuple[float, float]] = {}
 
-    def take(self, owner: str, rate: float | None) -> None:
+    def take(self, owner: str, rate: float | None, most: float | None = None) -> None:
         """Take one token from the owner's bucket.
 
         Args:
             owner: Owner of the request's key.
             rate: Requests per second that the owner may send on average; None for no limit.
+            most: Capacity of the bucket; None for the requests of ten seconds.
 
         Raises:
             RATE_LIMITED: If the owner's bucket is empty.
         """
         if rate is None:
             return
-        most = max(1.0, rate * _BURST_SECONDS)
+        most = most or max(1.0, rate * _BURST_SECONDS)
         now = self._clock()
         left, seen = self._left.pop(owner, (most, now))
         left = min(most, left + (now - seen) * rate)
@@ -305,3 +297,9 @@ class Rates:
             del self._left[next(iter(self._left))]  # the owner with the oldest last request
         if not allowed:
             raise problems.RATE_LIMITED(limit=rate, retry_after=math.ceil((1 - left) / rate))
+
+    def give_back(self, owner: str) -> None:
+        """Return the token of a request that does not count."""
+        if owner in self._left:
+            left, seen = self._left[owner]
+            self._left[owner] = left + 1, seen

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import JSONResponse, PlainTextResponse
@@ -30,28 +30,19 @@ from service.store.database import BUCKETS
 _SECONDS = 0.8
 
 
-class _Counter(NamedTuple):
-    """Help text of a counter, and its label with all possible values. Values without events are exported as 0."""
-
-    help: str
-    label: str | None = None
-    values: tuple[str, ...] = ()
-
-
 _ENDS = (JobStatus.SUCCEEDED, JobStatus.FAILED, JobStatus.CANCELED)
-_COUNTERS = {
-    "sgsst_jobs_submitted": _Counter("Jobs that were accepted."),
-    "sgsst_jobs_finished": _Counter("Jobs that have ended, by status.", "status", tuple(map(str, _ENDS))),
-    "sgsst_attempts": _Counter("Attempts that were started."),
-    "sgsst_attempts_ended": _Counter(
-        "Attempts that have ended, by outcome.", "outcome", tuple(map(str, AttemptOutcome))
-    ),
-    "sgsst_outages": _Counter(
+#: Help text of each counter, and its label with all possible values. Values without events are exported as 0.
+_COUNTERS: dict[str, tuple[str, str | None, tuple[str, ...]]] = {
+    "sgsst_jobs_submitted": ("Jobs that were accepted.", None, ()),
+    "sgsst_jobs_finished": ("Jobs that have ended, by status.", "status", tuple(map(str, _ENDS))),
+    "sgsst_attempts": ("Attempts that were started.", None, ()),
+    "sgsst_attempts_ended": ("Attempts that have ended, by outcome.", "outcome", tuple(map(str, AttemptOutcome))),
+    "sgsst_outages": (
         "Attempts that ended without the job's doing, by cause.",
         "cause",
         tuple(cause for cause in Cause if cause not in (Cause.JOB, Cause.DISPATCHER)),
     ),
-    "sgsst_lease_expirations": _Counter("Leases that expired because their dispatcher did not renew them."),
+    "sgsst_lease_expirations": ("Leases that expired because their dispatcher did not renew them.", None, ()),
 }
 _HISTOGRAMS = {
     "sgsst_queue_wait_seconds": "Seconds that jobs waited for their attempts.",
@@ -59,14 +50,17 @@ _HISTOGRAMS = {
 }
 
 
-class Metrics:
-    """Registry of everything that `/metrics` exports.
+class Metrics(Collector):
+    """Everything that `/metrics` exports.
+
+    What survives restarts is read from the database at each scrape.
 
     Args:
         folder: Folder of the service, on the disk that receives uploads.
     """
 
     def __init__(self, store: Store, folder: Path) -> None:
+        self._store, self._folder = store, folder
         self._registry = CollectorRegistry()
         self._requests = Counter(
             "sgsst_requests", "HTTP requests.", ["method", "route", "status"], registry=self._registry
@@ -74,7 +68,7 @@ class Metrics:
         self._seconds = Histogram(
             "sgsst_request_seconds", "Seconds until the response began.", ["method", "route"], registry=self._registry
         )
-        self._registry.register(_StoreCollector(store, folder))
+        self._registry.register(self)
 
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count a request."""
@@ -85,17 +79,12 @@ class Metrics:
         """Return all metrics in the Prometheus text format."""
         return generate_latest(self._registry)
 
-
-class _StoreCollector(Collector):
-    """Collector of metrics that survive restarts, because they are read from the database at each scrape."""
-
-    def __init__(self, store: Store, folder: Path) -> None:
-        self._store, self._folder = store, folder
-
     def describe(self) -> Iterable[Metric]:
+        """Return nothing: the names are not checked against those of others."""
         return []
 
     def collect(self) -> Iterable[Metric]:
+        """Yield the metrics of the database and the disk."""
         operations = self._store.operations
         depth = GaugeMetricFamily("sgsst_jobs", "Jobs by status.", labels=["status"])
         counts, waited, rate = operations.work()
@@ -119,16 +108,16 @@ class _StoreCollector(Collector):
         stored: defaultdict[str, dict[str, float]] = defaultdict(dict)
         for name, labels, value in self._store.operations.counters():
             stored[name][labels.partition("=")[2].strip('"')] = value
-        for name, counter in _COUNTERS.items():
-            family = CounterMetricFamily(name, counter.help, labels=[counter.label] if counter.label else None)
+        for name, (text, label, known) in _COUNTERS.items():
+            family = CounterMetricFamily(name, text, labels=[label] if label else None)
             values = stored[f"{name}_total"]
-            for label in sorted({*counter.values, *values} if counter.label else {""}):
-                family.add_metric([label] if counter.label else [], values.get(label, 0.0))
+            for value in sorted({*known, *values} if label else {""}):
+                family.add_metric([value] if label else [], values.get(value, 0.0))
             yield family
-        for name, help_text in _HISTOGRAMS.items():
+        for name, text in _HISTOGRAMS.items():
             buckets = stored[f"{name}_bucket"]
             number, total = (stored[f"{name}_{part}"].get("", 0.0) for part in ("count", "sum"))
-            yield HistogramMetricFamily(name, help_text, _cumulative(buckets, number), total)
+            yield HistogramMetricFamily(name, text, _cumulative(buckets, number), total)
 
 
 def _cumulative(buckets: dict[str, float], number: float) -> list[tuple[str, float]]:

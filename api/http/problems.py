@@ -6,7 +6,6 @@ bodies are defined with their models (`api.http.schemas`, `api.http.submission`,
 
 from __future__ import annotations
 
-import copy
 import errno
 import json
 import logging
@@ -15,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from http import HTTPStatus
 from typing import Any, TypeVar
 
-from fastapi import FastAPI, Request
+from fastapi import Request
 from fastapi.dependencies.models import Dependant
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -41,7 +40,6 @@ from sgsst_core.errors import (
     TooManyIntersectionsError,
     WeightsError,
 )
-from sgsst_core.files.formats import listed
 from sgsst_core.settings import merged, reason, unknown_text
 from worker.options import RegionOptions
 
@@ -89,17 +87,6 @@ def _response(status: int, code: str, detail: str, headers: dict[str, str], **ex
     return JSONResponse(body.model_dump(mode="json"), status, headers, media_type=MEDIA_TYPE)
 
 
-def add_handlers(app: FastAPI) -> None:
-    """Register handlers that convert every error of the app to a problem document."""
-    app.add_exception_handler(ServiceError, _expected)
-    app.add_exception_handler(InvalidInputError, _expected)
-    app.add_exception_handler(RequestValidationError, _invalid_request)
-    app.add_exception_handler(ValidationError, _invalid_request)
-    app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(OSError, _system_error)
-    app.add_exception_handler(Exception, _unexpected)
-
-
 def from_service(error: ServiceError) -> JSONResponse:
     """Return the problem document of a service error."""
     headers = dict(error.headers)
@@ -108,21 +95,22 @@ def from_service(error: ServiceError) -> JSONResponse:
     return _response(error.status, error.code, str(error), headers, **error.extra)
 
 
-async def _expected(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, ServiceError | InvalidInputError)
+async def _expected(request: Request, error: ServiceError | InvalidInputError) -> JSONResponse:
     known = error if isinstance(error, ServiceError) else problems.INVALID_INPUT(str(error), code=error.code)
     return from_service(known)
 
 
-async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError | ValidationError)
+async def _invalid_request(request: Request, error: RequestValidationError | ValidationError) -> JSONResponse:
     outer = int(
         isinstance(error, RequestValidationError)
     )  # its locations start with a part of the request: query, body
+    known = {*JobParameters.model_fields, *RegionOptions.model_fields}
     errors = [
         {
             "at": (at := ".".join(str(part) for part in entry["loc"][outer:])[:_SHOWN]),
-            "message": _unknown(at) if entry["type"] == "extra_forbidden" else reason(entry),
+            "message": unknown_text(at.rpartition(".")[2], known)
+            if entry["type"] == "extra_forbidden"
+            else reason(entry),
         }
         for entry in merged(error.errors())[:20]
     ]
@@ -130,13 +118,7 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     return from_service(problems.INVALID_REQUEST(f"{first['at'] or 'body'}: {first['message']}", errors=errors))
 
 
-def _unknown(at: str) -> str:
-    """Return the message for an unknown parameter of a job or region."""
-    return unknown_text(at.rpartition(".")[2], {*JobParameters.model_fields, *RegionOptions.model_fields})
-
-
-async def _http_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, HTTPException)
+async def _http_error(request: Request, error: HTTPException) -> JSONResponse:
     path = request.scope["path"][:_SHOWN]
     if error.status_code == 404:
         return from_service(problems.NOT_FOUND(f"There is nothing at {path!r}. {address('/docs')} lists all paths."))
@@ -155,8 +137,7 @@ def routed_methods(scope: Scope) -> list[str]:
     return [method for method in METHODS if any(route.matches(scopes[method])[0] is Match.FULL for route in routes)]
 
 
-async def _system_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, OSError)
+async def _system_error(request: Request, error: OSError) -> JSONResponse:
     if is_full(error):
         return from_service(problems.NO_SPACE())
     if error.errno not in (errno.EMFILE, errno.ENFILE):
@@ -170,6 +151,18 @@ async def _unexpected(request: Request, error: Exception) -> JSONResponse:
     extra = {"request_id": request_id}
     _log.exception("%s %s failed unexpectedly", request.method, logged_path(scope), exc_info=error, extra=extra)
     return from_service(problems.INTERNAL(request_id=request_id))
+
+
+#: Functions that convert every error of the app to a problem document.
+HANDLERS: dict[Any, Any] = {
+    ServiceError: _expected,
+    InvalidInputError: _expected,
+    RequestValidationError: _invalid_request,
+    ValidationError: _invalid_request,
+    HTTPException: _http_error,
+    OSError: _system_error,
+    Exception: _unexpected,
+}
 
 
 def route_of(scope: Scope) -> str:
@@ -424,10 +417,13 @@ def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any
             body = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
             operation["requestBody"] = {"required": True, "content": {"application/json": body}}
     raised += [problem for part, problem in _OF_PATHS.items() if part in route.path]
-    invalid = [each for parameter in operation.get("parameters", []) if (each := _invalid(parameter))]
+    checked = [each["name"] for each in operation.get("parameters", []) if _is_limited(each)]
     if "application/json" in operation.get("requestBody", {}).get("content", {}):
-        invalid.append(_invalid_example("body", "is not JSON: Expecting value: line 1 column 1 (char 0)."))
-    raised += [*invalid[:1], *_OF_OPERATIONS.get(operation["operationId"].replace("head_", "get_"), ())]
+        checked.append("body")
+    if checked:
+        errors = [{"at": checked[0], "message": "is not valid"}]
+        raised.append(problems.INVALID_REQUEST(f"{checked[0]}: is not valid", errors=errors))
+    raised += _OF_OPERATIONS.get(operation["operationId"].replace("head_", "get_"), ())
     responses = operation["responses"]
     responses.pop("422", None)  # FastAPI's own error schema
     for problem in raised:
@@ -435,30 +431,18 @@ def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any
         answer = from_service(example)
         document = json.loads(bytes(answer.body))
         response = responses.setdefault(str(example.status), {"description": f"{document['title']}: see `code`."})
-        schema = {"$ref": f"#/components/schemas/Problem{example.status}"}  # see `complete`
+        schema = {"$ref": "#/components/schemas/Problem"}
         content = response.setdefault("content", {}).setdefault(MEDIA_TYPE, {"schema": schema, "examples": {}})
         content["examples"][example.code] = {"value": document}
         names = [name for name in _HEADERS if name.lower() in answer.headers and name != "Content-Length"]
         response.setdefault("headers", {}).update(headers(*names))
 
 
-def _invalid(parameter: dict[str, Any]) -> ServiceError | None:
-    """Return an example error for a parameter; None if every value of it is valid."""
+def _is_limited(parameter: dict[str, Any]) -> bool:
+    """Return whether there are values that a parameter may not have."""
     schema = parameter["schema"]
-    schema = schema | schema.get("anyOf", [{}])[0]
-    at = parameter["name"]
-    if "le" in schema or "lt" in schema:
-        bound = "or equal to " if "le" in schema else ""
-        return _invalid_example(at, f"Input should be less than {bound}{schema.get('le', schema.get('lt'))}")
-    if "pattern" in schema and "const" not in schema:
-        return _invalid_example(at, f"String should match pattern '{schema['pattern']}'")
-    if "maxLength" in schema:
-        return _invalid_example(at, f"String should have at most {schema['maxLength']} characters")
-    return _invalid_example(at, f"Input should be {listed([*map(repr, schema['enum'])])}") if "enum" in schema else None
-
-
-def _invalid_example(at: str, message: str) -> ServiceError:
-    return problems.INVALID_REQUEST(f"{at}: {message}", errors=[{"at": at, "message": message}])
+    known = schema.keys() | schema.get("anyOf", [{}])[0].keys()
+    return "const" not in known and not known.isdisjoint(("le", "lt", "pattern", "maxLength", "enum"))
 
 
 def links(*operations: str, **parameters: str) -> dict[str, Any]:
@@ -470,8 +454,7 @@ def complete(document: dict[str, Any], routes: Sequence[BaseRoute], models: Sequ
     """Complete FastAPI's OpenAPI document in place.
 
     FastAPI omits models that no route takes as an argument, drops nulls from examples, and has its own error schemas.
-    Generators of clients support neither schemas that narrow another one nor constants in headers, and use the first
-    media type of a response.
+    Generators of clients do not support constants in headers, and use the first media type of a response.
     """
     schemas = document["components"]["schemas"]
     for model in models:
@@ -493,7 +476,6 @@ def complete(document: dict[str, Any], routes: Sequence[BaseRoute], models: Sequ
                     answer["content"] = {"application/json": None, **answer["content"]}
                 if method == "head":
                     answer.pop("content", None)
-    _add_problem_schemas(document)
     for unused in ("HTTPValidationError", "ValidationError"):
         schemas.pop(unused, None)
 
@@ -502,22 +484,3 @@ def _add_schema(schemas: dict[str, Any], model: type[BaseModel]) -> None:
     schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
     schemas |= schema.pop("$defs", {})
     schemas[model.__name__] = schema
-
-
-def _add_problem_schemas(document: dict[str, Any]) -> None:
-    """Add a schema for the problems of each status, with all codes that any operation documents for it."""
-    schemas = document["components"]["schemas"]
-    examples: dict[int, dict[str, Any]] = {}
-    for path in document["paths"].values():
-        for operation in path.values():
-            for status, answer in operation["responses"].items():
-                problem = answer.get("content", {}).get(MEDIA_TYPE)
-                if problem:
-                    known = {code: example["value"] for code, example in problem["examples"].items()}
-                    examples.setdefault(int(status), {}).update(known)
-    for status, by_code in sorted(examples.items()):
-        properties = copy.deepcopy(schemas["Problem"]["properties"])
-        properties["status"] |= {"const": status}
-        properties["code"] |= {"enum": sorted(by_code)}
-        title = {"title": f"Problem{status}", "examples": [next(iter(by_code.values()))]}
-        schemas[f"Problem{status}"] = {**schemas["Problem"], "properties": properties, **title}

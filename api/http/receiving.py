@@ -14,8 +14,8 @@ import gc
 import json
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import PurePosixPath
@@ -54,16 +54,11 @@ class Receipts:
     def __init__(self, inputs: InputRows, blobs: Blobs, threads: FileThreads) -> None:
         self.inputs, self._blobs, self._threads = inputs, blobs, threads
         self.active: set[str] = set()
-        self._renewing: asyncio.Task[None] | None = None
-
-    def start(self) -> None:
-        """Start the renewal task."""
         self._renewing = asyncio.create_task(self._renew())
 
     def close(self) -> None:
         """Stop the renewal task."""
-        if self._renewing is not None:
-            self._renewing.cancel()
+        self._renewing.cancel()
 
     async def end(self, owner: str, receipt: str) -> None:
         """Release the charge of a receipt, and delete the request's files unless other jobs or uploads use them."""
@@ -75,10 +70,11 @@ class Receipts:
         if unused:
             await self.remove(owner, partial(self._blobs.remove, unused))
 
-    async def remove(self, owner: str, files: Callable[[], None]) -> None:
+    async def remove(self, owner: str, *removals: Callable[[], None]) -> None:
         """Remove files that no database row refers to any longer; housekeeping removes those that remain."""
         try:
-            await self._threads.clean_up(self._threads.run(owner, files))
+            for remove in removals:
+                await self._threads.clean_up(self._threads.run(owner, remove))
         except (StoreError, OSError) as error:
             _log.warning("unused files not deleted yet: %s", error.__cause__ or error)
 
@@ -100,12 +96,13 @@ class Receipt:
 
     Attributes:
         id: Id in the database; None until something is charged.
+        received: Number of received bytes.
     """
 
     def __init__(self, receipts: Receipts, owner: str, quotas: Quotas) -> None:
         self.id: str | None = None
         self._receipts, self.owner, self._quotas = receipts, owner, quotas
-        self._charged = self._received = 0
+        self._charged = self.received = 0
 
     def charge(self, declared: int) -> None:
         """Charge bytes that the request, or a server it names, declares; 0 if it declares none.
@@ -126,11 +123,11 @@ class Receipt:
         Raises:
             QUOTA_EXCEEDED: If the owner would exceed the quota.
         """
-        self._received += size
-        more = self._received - self._charged
+        self.received += size
+        more = self.received - self._charged
         if more > 0 and self.id is not None:
             self._receipts.inputs.grow_receipt(self.id, more, self.owner, self._quotas)
-            self._charged = self._received
+            self._charged = self.received
 
     def hand_over(self) -> None:
         """Record that a job has taken over the files and their charge."""
@@ -166,6 +163,7 @@ _DRAIN_BYTES, _DRAIN_SECONDS = 64 << 20, 10.0
 
 
 Model = TypeVar("Model", bound=BaseModel)
+Value = TypeVar("Value")
 
 
 @dataclass
@@ -508,26 +506,21 @@ def file_name(url: str) -> str:
     return PurePosixPath(httpx2.URL(url).path).name
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Fetch:
-    """State of fetching the inputs of one request.
+    """Input by URL that is being fetched.
 
     Attributes:
+        url: URL as the client wrote it.
         deadline: Time of the event loop at which the request gives up.
-        left: Bytes that may still be fetched.
+        most: Limit of the receipt's received bytes.
     """
-
-    receipt: Receipt
-    deadline: float
-    left: int
-
-
-@dataclass(frozen=True)
-class _Input:
-    """Input by URL: the URL as the client wrote it, and the role of the file."""
 
     url: str
     role: str
+    receipt: Receipt
+    deadline: float
+    most: int
 
 
 class Fetcher:
@@ -550,7 +543,7 @@ class Fetcher:
         """
         urls = {text: role for _, role, text in references if is_url(text)}
         for url, role in urls.items():
-            self._parse(url, _Input(url, role))
+            self._parse(url, url, role)
         return urls
 
     async def fetch(self, urls: dict[str, str], receipt: Receipt) -> dict[str, str]:
@@ -569,94 +562,82 @@ class Fetcher:
             raise problems.BUSY("Too many inputs by URL are being fetched. Try again later.")
         async with limit:
             deadline = asyncio.get_running_loop().time() + self._settings.url_seconds
-            state = _Fetch(receipt, deadline, self._settings.url_bytes)
+            most = receipt.received + self._settings.url_bytes
             await asyncio.to_thread(receipt.charge, 0)
-            return {url: await self._fetch(_Input(url, role), state) for url, role in urls.items()}
+            return {url: await self._fetch(_Fetch(url, role, receipt, deadline, most)) for url, role in urls.items()}
 
-    def _parse(self, url: str, source: _Input) -> httpx2.URL:
-        """Parse the URL of an input, or of a redirect from it, and check that its host is allowed."""
+    def _parse(self, url: str, given: str, role: str) -> httpx2.URL:
+        """Parse the given URL of an input, or of a redirect from it, and check that its host is allowed."""
         if not self._allowed:
-            raise problems.URLS_OFF(input=source.role)
+            raise problems.URLS_OFF(input=role)
         try:
             parsed = parse_url(url)
         except ValueError as error:
-            raise _invalid(source, error) from error
+            raise _invalid(given, role, error) from error
         if origin(parsed) not in self._allowed:
             scheme, host, port = origin(parsed)
-            raise _invalid(source, f"'{scheme}://{host}:{port}' is not among the hosts that its operator allows")
+            raise _invalid(given, role, f"'{scheme}://{host}:{port}' is not among the hosts that its operator allows")
         return parsed
 
-    async def _fetch(self, source: _Input, state: _Fetch) -> str:
+    async def _fetch(self, source: _Fetch) -> str:
         """Fetch one file, and return its SHA-256."""
         async with AsyncExitStack() as stack:
-            chunks = await self._open(source, state, stack)
-            run = partial(self.threads.run, state.receipt.owner)
+            response = await self._open(source, stack)
+            declared = int(response.headers.get("content-length", "0"))  # only digits: h11 refuses anything else
+            self._check_size(declared, source)
+            await asyncio.to_thread(source.receipt.charge, declared)
+            chunks = response.aiter_raw(memory.share())
+            run = partial(self.threads.run, source.receipt.owner)
             file = await run(self._blobs.receive, self._settings.max_upload_bytes)
             try:
-                while chunk := await self._next(source, state, chunks):
-                    state.left -= len(chunk)
-                    self._check_size(0, state)
-                    await run(_write, chunk, file, state.receipt)
+                while chunk := await self._in_time(source, anext(chunks, b"")):
+                    self._check_size(len(chunk), source)
+                    await run(_write, chunk, file, source.receipt)
                 name = staged_name(source.role, file_name(source.url))
-                sha256 = await run(_keep, file, source.role, name, self._blobs, state.receipt, size=file.size)
+                sha256 = await run(_keep, file, source.role, name, self._blobs, source.receipt, size=file.size)
             except BaseException:
                 await self.threads.clean_up(run(file.discard))
                 raise
             _log.info("input fetched: host=%s bytes=%d", parse_url(source.url).host, file.size)
             return sha256
 
-    async def _open(self, source: _Input, state: _Fetch, stack: AsyncExitStack) -> AsyncIterator[bytes]:
-        """Follow redirects to the file, and return its chunks. The stack closes the connection."""
-        url = self._parse(source.url, source)
+    async def _open(self, source: _Fetch, stack: AsyncExitStack) -> httpx2.Response:
+        """Follow redirects to the file, and return the response with it. The stack closes the connection."""
+        url = self._parse(source.url, source.url, source.role)
         for _ in range(1 + _MAX_REDIRECTS):
             answer = send("GET", url, _HEADERS, private_allowed=self._settings.url_private_addresses)
-            with self._failures(source):
-                async with asyncio.timeout_at(state.deadline):
-                    response = await stack.enter_async_context(answer)
+            response = await self._in_time(source, stack.enter_async_context(answer))
             location = response.headers.get("location")
             if response.status_code not in _REDIRECTS or location is None:
-                return await self._body(source, state, response)
+                if response.status_code != httpx2.codes.OK:
+                    raise _not_fetched(source, f"the server answered {response.status_code}")
+                if response.headers.get("content-encoding", "identity").strip().lower() != "identity":
+                    raise _not_fetched(source, "the server compresses the file")
+                return response
             await stack.aclose()
             try:
                 target = str(url.join(location))
             except (httpx2.InvalidURL, ValueError) as error:
                 raise _not_fetched(source, _INVALID_REDIRECT) from error
-            url = self._parse(target, source)
+            url = self._parse(target, source.url, source.role)
         raise _not_fetched(source, f"the server redirects more than {_MAX_REDIRECTS} times")
 
-    async def _body(self, source: _Input, state: _Fetch, response: httpx2.Response) -> AsyncIterator[bytes]:
-        """Check the head of a response, and return the chunks of its body."""
-        if response.status_code != httpx2.codes.OK:
-            raise _not_fetched(source, f"the server answered {response.status_code}")
-        if response.headers.get("content-encoding", "identity").strip().lower() != "identity":
-            raise _not_fetched(source, "the server compresses the file")
-        declared = int(response.headers.get("content-length", "0"))  # only digits: h11 refuses anything else
-        self._check_size(declared, state)
-        await asyncio.to_thread(state.receipt.charge, declared)
-        return response.aiter_raw(memory.share())
-
-    async def _next(self, source: _Input, state: _Fetch, chunks: AsyncIterator[bytes]) -> bytes:
-        """Return the next chunk of a file; b"" at its end."""
-        with self._failures(source):
-            async with asyncio.timeout_at(state.deadline):
-                return await anext(chunks, b"")
-
-    def _check_size(self, more: int, state: _Fetch) -> None:
-        if more > state.left:
+    def _check_size(self, more: int, source: _Fetch) -> None:
+        if source.receipt.received + more > source.most:
             limit = self._settings.url_bytes
             raise problems.TOO_LARGE(
                 f"The inputs by URL have more than {limit:,} bytes. Upload large files.", limit=limit
             )
 
-    @contextmanager
-    def _failures(self, source: _Input) -> Iterator[None]:
-        """Raise URL_NOT_FETCHED or INVALID_URL in place of failures of the network."""
+    async def _in_time(self, source: _Fetch, step: Awaitable[Value]) -> Value:
+        """Wait for a step until the deadline; raise URL_NOT_FETCHED or INVALID_URL if the network fails."""
         try:
-            yield
+            async with asyncio.timeout_at(source.deadline):
+                return await step
         except TimeoutError as error:
             raise _not_fetched(source, f"it did not arrive within {self._settings.url_seconds:g} s") from error
         except PermissionError as error:  # its message has the address, which is none of the client's business
-            raise _invalid(source, "its host has an address that is not public") from error
+            raise _invalid(source.url, source.role, "its host has an address that is not public") from error
         except httpx2.InvalidURL as error:  # httpx2 parses the target of a redirect even if it does not follow it
             raise _not_fetched(source, _INVALID_REDIRECT) from error
         except (httpx2.HTTPError, OSError) as error:
@@ -664,11 +645,11 @@ class Fetcher:
             raise _not_fetched(source, reason) from error
 
 
-def _invalid(source: _Input, reason: object) -> ServiceError:
-    return problems.INVALID_URL(url=source.url[:100], reason=reason, input=source.role)
+def _invalid(url: str, role: str, reason: object) -> ServiceError:
+    return problems.INVALID_URL(url=url[:100], reason=reason, input=role)
 
 
-def _not_fetched(source: _Input, reason: str) -> ServiceError:
+def _not_fetched(source: _Fetch, reason: str) -> ServiceError:
     return problems.URL_NOT_FETCHED(url=source.url[:100], reason=reason, input=source.role)
 
 

@@ -184,6 +184,12 @@ class Service:
             )
 
 
+def orbit_options(preset: str, views: int, up: str, minutes: float) -> dict[str, Any]:
+    """Return the parameters of a job without cameras; 0 views are as many as needed, 0 minutes no limit."""
+    limit = {"within": 60 * minutes} if minutes > 0 else {}
+    return {"preset": preset, "orbit": views or "auto", "up": up, **limit}
+
+
 def fraction(job: dict[str, Any]) -> float:
     """Return the fraction of a job's steps that is completed."""
     progress = job["progress"]

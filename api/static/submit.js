@@ -62,7 +62,7 @@ export class SubmitView {
     this.example = new ExamplePart(() => this.startExample());
     this.paintings = new PaintingsPart(this.slots.style, this.regions, () => this.styleChanged());
     this.views = new ViewsPart(this.slots, this.stage, this.options, this.crop, () => this.refresh());
-    this.scene = new ScenePart(this.slots.scene, this.stage, { loaded: () => this.views.showCameras(), reload: () => this.sceneChanged() });
+    this.scene = new ScenePart(this.slots.scene, this.stage, { loaded: () => this.views.showCameras(false), reload: () => this.sceneChanged() });
     this.submission = new Submission(this.leaving.signal);
     this.refusals = new Refusals(this.slots, this.options, this.regions);
     this.build();

@@ -24,7 +24,7 @@ export class ViewsPart {
    * @param {Stage} stage
    * @param {import("./options_part.js").OptionsPart} options
    * @param {import("./crop_panel.js").CropPanel} crop
-   * @param {() => void} changed called after the views have changed
+   * @param {() => void} changed called when the views change
    */
   constructor(slots, stage, options, crop, changed) {
     this.slots = slots;
@@ -92,9 +92,10 @@ export class ViewsPart {
     this.showCameras();
   }
 
-  async showCameras() {
+  /** Show the cameras. A change is told before files are read, so that it clears no answer that comes meanwhile. @param {boolean} [changed] whether the views have changed */
+  async showCameras(changed = true) {
     const { cameras: slot } = this.slots, { viewer } = this.stage, turn = ++this.turn;
-    slot.wrong("");
+    if (changed) this.changed();
     let cameras = /** @type {JobCamera[]} */ ([]), told = "";
     if (this.orbiting) [cameras, told] = this.ringNow();
     else if (slot.files.length) {
@@ -108,7 +109,6 @@ export class ViewsPart {
     if (turn !== this.turn) return;
     this.found.textContent = told;
     if (viewer) this.stage.setCameras(cameras, { frames: true, stand: !this.orbiting && !viewer.touched });
-    this.changed();
   }
 
   /** @returns {[JobCamera[], string]} */

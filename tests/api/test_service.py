@@ -198,9 +198,7 @@ def test_compressed_scene_and_results_in_other_formats(
     assert list((service.data / "packing").iterdir()) == []
     command = [sys.executable, "-m", "api.cli", "download", job_id, "--url", service.url]
     command += ["--out", str(tmp_path / "other.compressed.ply")]
-    ended = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)
-    assert "compressed.ply, " in ended.stderr
-    assert "dB PSNR against the PLY" in ended.stderr
+    subprocess.run(command, check=True, env=service.environment, cwd=ROOT)
     assert read_scene(tmp_path / "other.compressed.ply").format == "compressed.ply"
     assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
     assert client.get(where, params={"format": "spz"}).status_code == 404

@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from .sgsst_rest import COLORS, REQUIRED, BackgroundJob, Service, read_colors, write_splat
+from .sgsst_rest import COLORS, REQUIRED, BackgroundJob, Service, orbit_options, read_colors, write_splat
 
 #: Factor of the first spherical harmonic.
 _SH_C0 = 0.28209479177387814
@@ -123,9 +123,7 @@ def start(source: Any, settings: Any, service: Service) -> None:
     Current.folder = tempfile.TemporaryDirectory()
     scene, out = (Path(Current.folder.name) / name for name in ("splat.ply", "stylized.ply"))
     write_splat(scene, splat_columns(source.data))
-    options = {"preset": settings.preset, "orbit": settings.views or "auto", "up": settings.up}
-    if settings.minutes:
-        options["within"] = 60 * settings.minutes
+    options = orbit_options(settings.preset, settings.views, settings.up, settings.minutes)
     Current.job = BackgroundJob(service, (scene, style, out), **options)
     Current.source_name, Current.message = source.name, ""
     Current.job.start()

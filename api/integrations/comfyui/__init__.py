@@ -1,4 +1,4 @@
-"""Nodes of ComfyUI: stylize a Gaussian splat on a service of sgsst, blend two, and render views of a stylized one."""
+"""Nodes of ComfyUI: stylize a Gaussian splat on a service of sgsst, and blend two."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import torch
 from comfy import model_management
@@ -16,27 +15,11 @@ from comfy_api.latest import IO, ComfyExtension, Types
 from comfy_extras.nodes_gaussian_splat import File3DToSplat, SplatToFile3D
 from PIL import Image
 
-from .sgsst_rest import Service, fraction
+from .sgsst_rest import Service, fraction, orbit_options
 
 _CATEGORY = "3d/splat"
 #: Steps of the progress bar.
 _STEPS = 1000
-
-
-def _service_input() -> Any:
-    return IO.String.Input(
-        "service",
-        default="",
-        optional=True,
-        advanced=True,
-        tooltip="Address of the service; empty for SGSST_URL, or http://127.0.0.1:8000. The key in SGSST_KEY is only "
-        "sent to the service of SGSST_URL.",
-    )
-
-
-def _tensor(image: Image.Image) -> torch.Tensor:
-    """Return an image as ComfyUI stores it, [1, height, width, 3] float32 in 0..1."""
-    return torch.from_numpy(np.asarray(image.convert("RGB"), dtype=np.float32) / 255)[None]
 
 
 def _real_count(splat: Any) -> int:
@@ -87,7 +70,14 @@ class Stylize(IO.ComfyNode):
                     default="-y",
                     tooltip="Up axis of the splat; ComfyUI's own splats have -y.",
                 ),
-                _service_input(),
+                IO.String.Input(
+                    "service",
+                    default="",
+                    optional=True,
+                    advanced=True,
+                    tooltip="Address of the service; empty for SGSST_URL, or http://127.0.0.1:8000. The key in "
+                    "SGSST_KEY is only sent to the service of SGSST_URL.",
+                ),
             ],
             outputs=[
                 IO.Splat.Output(display_name="stylized"),
@@ -103,9 +93,7 @@ class Stylize(IO.ComfyNode):
         """Run the job; return the stylized splat, an image of it, and the job's id."""
         count = _real_count(splat)
         connection = Service(service)
-        options: dict[str, Any] = {"preset": preset, "orbit": views or "auto", "up": up}
-        if minutes:
-            options["within"] = 60 * minutes
+        options = orbit_options(preset, views, up, minutes)
         with tempfile.TemporaryDirectory() as folder:
             scene, style_file, out = (Path(folder) / name for name in ("splat.ply", "style.png", "stylized.ply"))
             SplatToFile3D.execute(splat, "ply")[0].save_to(str(scene))
@@ -122,6 +110,8 @@ class Stylize(IO.ComfyNode):
 
 def _follow(connection: Service, job_id: str) -> torch.Tensor:
     """Wait until a job has succeeded, show its progress and newest image, and return the last image.
+
+    It is an image of ComfyUI, [1, height, width, 3] float32 in 0..1.
 
     Raises:
         comfy.model_management.InterruptProcessingException: If the user interrupts, which cancels the job.
@@ -141,7 +131,7 @@ def _follow(connection: Service, job_id: str) -> torch.Tensor:
         connection.cancel(job_id)
         raise
     assert image is not None
-    return _tensor(image)
+    return torch.from_numpy(np.asarray(image.convert("RGB"), dtype=np.float32) / 255)[None]
 
 
 class Blend(IO.ComfyNode):
@@ -182,47 +172,12 @@ class Blend(IO.ComfyNode):
         return IO.NodeOutput(_with_colors(original, torch.lerp(first, second.to(first), weight)))
 
 
-class RenderViews(IO.ComfyNode):
-    """Node that renders a job's result with the rasterizer of the service."""
-
-    @classmethod
-    def define_schema(cls) -> Any:
-        """Return inputs and outputs of the node."""
-        return IO.Schema(
-            node_id="SgsstRenderViews",
-            display_name="Render Views (SGSST)",
-            category=_CATEGORY,
-            description="Render views of a stylized splat on a full turn around it, as the service shows them.",
-            inputs=[
-                IO.String.Input("job", force_input=True, tooltip="Output `job` of Stylize Splat."),
-                IO.Int.Input("frames", default=24, min=1, max=240, tooltip="1 for a still image."),
-                IO.Int.Input("resolution", default=1024, min=64, max=1920, tooltip="Longer side in pixels."),
-                IO.Boolean.Input("compare", default=False, tooltip="Start with the unstylized splat."),
-                _service_input(),
-            ],
-            outputs=[IO.Image.Output(display_name="images")],
-        )
-
-    @classmethod
-    def execute(cls, job: str, frames: int, resolution: int, compare: bool, service: str = "") -> Any:
-        """Return the images, [frames, height, width, 3]."""
-        connection = Service(service)
-        # The service renders at most 60 frames per second and 30 seconds.
-        fps = min(24, frames)
-        video = {"path": "orbit", "fps": fps, "seconds": frames / fps, "resolution": resolution, "compare": compare}
-        connection.json("POST", f"/v1/jobs/{job}/video", video)
-        with connection.request("GET", f"/v1/jobs/{job}/artifacts/video.mp4") as answer:
-            content = io.BytesIO(answer.read())
-        with av.open(content, "r") as container:
-            return IO.NodeOutput(torch.cat([_tensor(frame.to_image()) for frame in container.decode(video=0)]))
-
-
 class Extension(ComfyExtension):
     """Nodes of this package."""
 
     async def get_node_list(self) -> list[type[Any]]:
         """Return the classes of all nodes."""
-        return [Stylize, Blend, RenderViews]
+        return [Stylize, Blend]
 
 
 async def comfy_entrypoint() -> Extension:

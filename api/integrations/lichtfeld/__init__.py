@@ -13,7 +13,7 @@ import numpy as np
 
 import lichtfeld as lf
 
-from .sgsst_rest import BackgroundJob, Service, read_colors, write_splat
+from .sgsst_rest import BackgroundJob, Service, orbit_options, read_colors, write_splat
 
 _PRESETS = ["preview", "standard", "paper"]
 _UP = ["auto", "-y", "y", "-z", "z", "-x", "x"]
@@ -29,15 +29,14 @@ class Painting:
 
     Attributes:
         amount: Weight of the style; 0 is the original, 1 the result.
-        edge: Fraction of the view's width, from the left, that shows the original.
     """
 
     def __init__(self, name: str, original: Any) -> None:
         self.name, self.original, self.painted = name, original, original
-        self.amount, self.edge = 1.0, 0.0
+        self.amount = 1.0
 
     def show(self, colors: Any = None) -> None:
-        """Set the splat's colors to the given ones, [N, 3], or to the blend and wipe of original and painted.
+        """Set the splat's colors to the given ones, [N, 3], or to the blend of original and painted.
 
         Raises:
             ValueError: If the splat is gone, or has changed.
@@ -45,8 +44,6 @@ class Painting:
         if colors is None:
             amount = np.float32(self.amount)
             colors = (1 - amount) * self.original + amount * self.painted  # exactly the result at 1
-            if self.edge > 0:
-                colors = np.where(self._is_left()[:, None], self.original, colors)
         scene = lf.get_scene()
         sh0 = splat_of(self.name).sh0_raw
         if sh0.shape[0] != len(colors):
@@ -54,19 +51,6 @@ class Painting:
         values = lf.Tensor.from_numpy(np.ascontiguousarray(colors[:, None], np.float32))
         sh0[0 : len(colors)] = values.cuda() if sh0.is_cuda else values
         scene.notify_changed()
-
-    def _is_left(self) -> Any:
-        """Return for each Gaussian whether it is left of the edge in the current view, [N] bool.
-
-        Raises:
-            ValueError: If other splats are visible.
-        """
-        view = lf.get_current_view()
-        shape = (view.rotation, view.translation, view.width, view.height)
-        positions = lf.compute_screen_positions(*shape, fov=view.fov_y)
-        if positions is None or positions.shape[0] != len(self.original):
-            raise ValueError(f"Hide all splats but {self.name} to wipe.")
-        return positions.cpu().numpy()[:, 0] < self.edge * view.width
 
     def finish(self, result: Any) -> None:
         """Show the result, [N, 3], as a step that LichtFeld Studio can undo."""
@@ -188,10 +172,7 @@ class SgsstPanel(lf.ui.Panel):
         style = Path(self._style)
         if not style.is_file():
             raise ValueError(f"There is no painting {self._style!r}. Choose an image file.")
-        options: dict[str, Any] = {"preset": _PRESETS[self._preset], "orbit": self._views or "auto"}
-        options["up"] = _UP[self._up]
-        if self._minutes > 0:
-            options["within"] = 60 * self._minutes
+        options = orbit_options(_PRESETS[self._preset], self._views, _UP[self._up], self._minutes)
         return Running(lf.get_selected_node_name(), style, Service(self._service), options)
 
     def _draw_progress(self, ui: Any, running: Running) -> None:
@@ -210,14 +191,9 @@ class SgsstPanel(lf.ui.Panel):
         SgsstPanel.running = None
 
     def _draw_comparison(self, ui: Any, painting: Painting) -> None:
-        weighted, painting.amount = ui.slider_float("Amount of style", painting.amount, 0.0, 1.5)
-        wiped, painting.edge = ui.slider_float("Wipe", painting.edge, 0.0, 1.0)
-        try:
-            if weighted or wiped:
-                painting.show()
-        except ValueError:
-            painting.edge = 0.0
-            raise
+        changed, painting.amount = ui.slider_float("Amount of style", painting.amount, 0.0, 1.5)
+        if changed:
+            painting.show()
 
 
 def on_load() -> None:

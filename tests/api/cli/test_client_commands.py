@@ -52,7 +52,7 @@ def test_exit_codes_and_errors_as_json(
         (["status"], 2, "usage"),
         (["jobs", "--limt", "3"], 2, "usage"),
         (["submit", files[0], "--style", "missing.png", "--orbit", "3"], 2, ""),
-        (["submit", *files, "--parameters", '{"resolutoin": 3}'], 2, "invalid-request"),
+        (["submit", *files, "--retention-days", "9999"], 2, "invalid-request"),
     ):
         assert main([*command, "--json"]) == code, command
         out, error = capsys.readouterr()
@@ -60,7 +60,6 @@ def test_exit_codes_and_errors_as_json(
         content = json.loads(error)
         assert content["code"].startswith(kind)
         assert content["detail"]
-    assert "Did you mean 'resolution'?" in content["detail"]
     sgsst(["cancel", job_id])
     sgsst(["watch", job_id], 5)  # the job did not succeed
     assert sgsst(["status", MISSING], 3) == f"error: There is no job {MISSING}.\n"
@@ -194,9 +193,6 @@ def test_names_of_results_are_checked_before_any_request(sgsst: Sgsst) -> None:
     for arguments, message in (
         (["--out", "x.usdz"], "x.usdz: does not end in .ply"),
         (["--out", "x.zip"], "x.zip: does not end in .ply"),
-        (["--format", "html", "--out", "x.ply"], "ends in .ply, but the format of the download is html"),
-        (["--format", "spz", "--out", "x.zip"], "Give a name that ends in .spz"),
-        (["report.html", "--out", "x.ply"], "Give a name that ends in .html"),
     ):
         assert message in " ".join(sgsst(["download", MISSING, *arguments, "--url", "http://127.0.0.1:1"], 2).split())
 
@@ -250,19 +246,19 @@ def test_address_or_key_that_cannot_be_used_is_refused(option: str, value: str, 
 
 
 @pytest.mark.parametrize(
-    ("variable", "value", "message"),
+    ("variable", "value"),
     [
-        ("ALL_PROXY", "socks5://user:secret@127.0.0.1:9", "ALL_PROXY=socks5://127.0.0.1:9 cannot be used"),
-        ("http_proxy", "socks9://127.0.0.1:9", "http_proxy=socks9://127.0.0.1:9 cannot be used"),
-        ("HTTP_PROXY", "127.0.0.1:65536", "HTTP_PROXY=127.0.0.1:65536 cannot be used"),
-        ("HTTPS_PROXY", "http://[::1", "HTTPS_PROXY=http://[::1 cannot be used"),
-        ("SSL_CERT_FILE", "/nonexistent", "SSL_CERT_FILE=/nonexistent cannot be used"),
-        ("SSL_CERT_FILE", os.devnull, f"SSL_CERT_FILE={os.devnull} cannot be used"),
-        ("SSLKEYLOGFILE", "/nonexistent/keys", "SSLKEYLOGFILE=/nonexistent/keys cannot be used"),
+        ("ALL_PROXY", "socks5://user:secret@127.0.0.1:9"),
+        ("http_proxy", "socks9://127.0.0.1:9"),
+        ("HTTP_PROXY", "127.0.0.1:65536"),
+        ("HTTPS_PROXY", "http://[::1"),
+        ("SSL_CERT_FILE", "/nonexistent"),
+        ("SSL_CERT_FILE", os.devnull),
+        ("SSLKEYLOGFILE", "/nonexistent/keys"),
     ],
 )
 def test_environment_that_cannot_be_used_is_reported(
-    variable: str, value: str, message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    variable: str, value: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No thread is left that would keep the process running."""
     monkeypatch.delenv("SSL_CERT_FILE", raising=False)
@@ -272,7 +268,7 @@ def test_environment_that_cannot_be_used_is_reported(
     assert main(["jobs"]) == 2
     assert threading.enumerate() == before
     shown = capsys.readouterr().err
-    assert message in shown.replace(" or no_proxy=elsewhere.example", "")
+    assert variable in shown.partition(" cannot be used")[0]
     assert "Correct or unset it." in shown
     assert "secret" not in shown
     with pytest.raises(RequestError, match="cannot be used"):

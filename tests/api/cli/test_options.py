@@ -3,7 +3,7 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import pytest
 import typer
@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from pydantic import ValidationError
 
 from api.cli.main import app
-from api.cli.options import flags, help_text, reference
+from api.cli.options import flags, help_text, is_switch, kind_of, metavar
 from service.inputs import JobParameters
 from sgsst_core.errors import SettingsError
 from sgsst_core.settings import Declared, Settings, checked, declared, make_settings, parse_seconds, parse_strength
@@ -119,12 +119,22 @@ def test_non_finite_numbers_are_rejected(value: str, sgsst: Sgsst) -> None:
         assert flag in sgsst(["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", flag, value], 2)
 
 
+def row(option: Declared, parameter: str) -> str:
+    """Return the row of an option in the reference."""
+    kind = kind_of(option)
+    words = ("on", "off") if is_switch(option) else get_args(kind) if get_origin(kind) is Literal else ()
+    values = words or filter(None, (option.bounds and f"`{option.bounds}`", option.option.unit))
+    shown = flags(option) if words else f"{flags(option)} {metavar(option)}"
+    default = option.text(option.info.default)
+    return f"| `{shown}` | {parameter} | {', '.join(values) or 'text'} | {default} | {option.help} |"
+
+
 def test_options_reference_is_up_to_date() -> None:
-    page = (ROOT / "docs" / "options.md").read_text()
-    assert page == reference(), "run: python -m api.cli.options > docs/options.md"
-    for option in [*declared(JobParameters).values(), *declared(RunOptions).values()]:
-        assert f"| `{flags(option)}" in page
-        assert option.help in page
+    rows = [row(option, f"`{option.name}`") for option in declared(JobParameters).values()]
+    rows += [row(option, "") for option in declared(RunOptions).values()]
+    page = (ROOT / "docs" / "options.md").read_text().splitlines()
+    assert [each for each in rows if each not in page] == [], "rows that docs/options.md lacks"
+    assert sum(line.startswith("| `--") for line in page) == len(rows), "rows of options that do not exist"
 
 
 def test_options_become_settings() -> None:

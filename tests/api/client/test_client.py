@@ -21,9 +21,9 @@ import pytest
 import stamina
 import torch
 
-from api.client import AsyncClient, Client, uploads
+from api.client import AsyncClient, Client
+from api.client.client import camera_files, image_files
 from api.client.transport import TRIES, ApiError, Event, Job, RequestError
-from api.client.uploads import camera_files, image_files
 from sgsst_core.files.atomic import temporary_path
 from tests.api.service import Service
 from tests.http_servers import LocalServer, send
@@ -144,7 +144,7 @@ def test_job_from_upload_to_removal(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(uploads, "PART_BYTES", 10_000)
+    monkeypatch.setattr("api.client.client.PART_BYTES", 10_000)
     reported: list[tuple[int, int]] = []
     with connect(service.url) as client:
         submitted: Job = client.submit(
@@ -430,7 +430,7 @@ def test_upload_resumes_after_lost_connection(
     connect: Any, service: Service, paths: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The response to a part is lost. The client sends the part again; the service refuses it as already received."""
-    monkeypatch.setattr(uploads, "PART_BYTES", 20_000)
+    monkeypatch.setattr("api.client.client.PART_BYTES", 20_000)
     # Connections stay open: the first one of each relay passes the answer to the creation, not that to the first part.
     with Relay(int(service.environment["SGSST_PORT"]), [900]) as relay, connect(relay.url) as client:
         uploaded = client.upload(paths["scene"])

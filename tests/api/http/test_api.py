@@ -19,9 +19,9 @@ import pytest
 from annotated_types import Ge, Gt
 from PIL import Image
 
+from api.cli.machine_commands import run_service
 from api.cli.main import main
 from api.cli.options import kind_of
-from api.cli.supervisor import ServeError, serve
 from service.files.blobs import BlobFolder
 from service.files.objects import Artifacts
 from service.inputs import JobParameters
@@ -29,6 +29,7 @@ from service.scheduling.housekeeping import Housekeeper
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
+from sgsst_core.errors import SettingsError
 from sgsst_core.progress import Progress
 from sgsst_core.settings import Declared, declared
 from tests.api.http.sending import (
@@ -454,8 +455,8 @@ def test_web_pages_cannot_use_a_service_without_keys(client: httpx2.Client) -> N
 
 
 def test_reachable_service_without_keys_does_not_start(tmp_path: Path) -> None:
-    with pytest.raises(ServeError, match="there is no API key"):
-        serve(ServiceSettings(data=tmp_path / "data", host="0.0.0.0"), print)
+    with pytest.raises(SettingsError, match="there is no API key"):
+        run_service(ServiceSettings(data=tmp_path / "data", host="0.0.0.0"), print)
 
 
 def test_partial_files_of_dead_process_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

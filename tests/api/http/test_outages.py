@@ -24,8 +24,8 @@ import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.responses import StreamingResponse
 
+from api.http.access import MOST_FAILURES
 from api.http.app import Deadlines, create_app
-from api.http.sessions import MOST_FAILURES
 from service import problems
 from service.deadlines import FileThreads, suspended
 from service.problems import SHARE_ID, SHARE_TOKEN, StoreError

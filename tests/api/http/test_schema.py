@@ -173,12 +173,9 @@ def test_every_refusal_has_its_codes(label: str, operation: dict[str, Any]) -> N
             assert label.startswith("HEAD") or (label, status) == ("GET /readyz", 503)
             continue
         body = answer["content"][MEDIA_TYPE]
-        assert body["schema"] == {"$ref": f"#/components/schemas/Problem{status}"}
-        properties = resolved(body["schema"])["properties"]
+        assert body["schema"] == {"$ref": "#/components/schemas/Problem"}
         shown = {code: example["value"] for code, example in body["examples"].items()}
         assert shown
-        assert properties["status"]["const"] == status
-        assert set(properties["code"]["enum"]) >= shown.keys()
         assert all(value["code"] == code and value["status"] == status for code, value in shown.items())
 
 

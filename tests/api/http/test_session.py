@@ -9,7 +9,8 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from api.http.sessions import MOST_FAILURES, WITHIN_SECONDS, SignIns
+from api.http.access import MOST_FAILURES, SECONDS_A_TRY
+from api.http.context import Rates
 from service import problems
 from service.scheduling.capacity import Machine
 from service.settings import ServiceSettings
@@ -277,7 +278,7 @@ def test_failed_sign_ins_are_limited_temporarily(service: Service, store: Store)
             refused(answer, 401, "unauthorized")
         answer = sign_in(browser, key)
         refused(answer, 429, "too-many-tries")
-        assert 0 < int(answer.headers["retry-after"]) <= WITHIN_SECONDS + 1
+        assert 0 < int(answer.headers["retry-after"]) <= SECONDS_A_TRY
         # The limit does not block a valid key from the same address.
         assert browser.get("/v1/jobs", headers={"Authorization": f"Bearer {key}"}).status_code == 200
 
@@ -308,17 +309,22 @@ def test_only_trusted_proxy_sets_client_address(tmp_path: Path, trusted: str) ->
 
 def test_sign_in_failures_expire() -> None:
     now = 0.0
-    tries = SignIns(lambda: now)
+    tries = Rates(lambda: now)
+
+    def attempt(address: str) -> None:
+        tries.take(address, 1 / SECONDS_A_TRY, MOST_FAILURES)
+
     for _ in range(MOST_FAILURES):
-        tries.attempt("a")
-    with raises_problem(problems.TOO_MANY_TRIES):
-        tries.attempt("a")
-    tries.attempt("b")
-    now = WITHIN_SECONDS
-    tries.attempt("a")
-    tries.succeeded("a")
-    for _ in range(MOST_FAILURES):
-        tries.attempt("a")
+        attempt("a")
+    with raises_problem(problems.RATE_LIMITED):
+        attempt("a")
+    attempt("b")
+    now = SECONDS_A_TRY + 1
+    attempt("a")
+    tries.give_back("a")
+    attempt("a")
+    with raises_problem(problems.RATE_LIMITED):
+        attempt("a")
 
 
 def test_session_expires(tmp_path: Path) -> None:

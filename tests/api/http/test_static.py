@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from api.http.static import DOCS_POLICY, POLICY, StaticFiles, static_files
+from api.http.sending import DOCS_POLICY, POLICY, StaticFiles, static_files
 from api.static_files import FOLDER, exported_viewer
 from sgsst_core.files.formats import DOWNLOADS, FORMATS
 from sgsst_core.files.scene_file import read_scene

@@ -59,7 +59,6 @@ class Studio:
         self.splat, self.changes, self.selected = Splat(scene), 0, "Splat"
         self.steps: list[tuple[str, Callable[[], None], Callable[[], None]]] = []
         self.panels: list[Any] = []
-        self.positions: Any = None
 
     def get_node(self, name: str) -> Any:
         return SimpleNamespace(splat_data=lambda: self.splat) if name == "Splat" else None
@@ -70,15 +69,12 @@ class Studio:
     def module(self) -> ModuleType:
         """Return the module `lichtfeld`."""
         module = ModuleType("lichtfeld")
-        view = SimpleNamespace(rotation=None, translation=None, width=100, height=80, fov_y=40.0)
         vars(module).update(
             Tensor=Tensor,
             ui=SimpleNamespace(Panel=object, PanelSpace=PanelSpace, request_redraw=lambda: None),
             undo=SimpleNamespace(push=lambda name, undo, redo: self.steps.append((name, undo, redo))),
             get_scene=lambda: self,
             get_selected_node_name=lambda: self.selected,
-            get_current_view=lambda: view,
-            compute_screen_positions=lambda rotation, translation, width, height, fov: self.positions,
             register_class=self.panels.append,
             unregister_class=self.panels.remove,
         )

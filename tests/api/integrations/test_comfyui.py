@@ -76,7 +76,7 @@ def test_schemas_fit_nodes_and_workflow(nodes: ModuleType) -> None:
         assert [each["type"] for each in node["outputs"]] == [each.io_type for each in schema.outputs]
 
 
-def test_stylize_blend_and_render(nodes: ModuleType, service: Service, image: torch.Tensor, tmp_path: Path) -> None:
+def test_stylize_and_blend(nodes: ModuleType, service: Service, image: torch.Tensor, tmp_path: Path) -> None:
     splat = comfy_stand_in.splat_of(wall(sh_degree=1))
     count = splat.positions.shape[1]
     for name in ("positions", "scales", "rotations", "opacities", "sh"):  # padding, as in a batch that was split
@@ -95,9 +95,6 @@ def test_stylize_blend_and_render(nodes: ModuleType, service: Service, image: to
     assert torch.equal(stylized.positions, splat.positions[:, :count])
     blend = nodes.Blend.execute(splat, stylized, 0.25)[0]
     torch.testing.assert_close(blend.sh, 0.75 * splat.sh[:, :count] + 0.25 * stylized.sh)
-    images = nodes.RenderViews.execute(job, frames=3, resolution=96, compare=False)[0]
-    assert (images.shape[0], max(images.shape[1:3]), images.shape[3]) == (3, 96, 3)
-    assert images.std() > 0.01
 
 
 def test_interruption_cancels_the_job(nodes: ModuleType, service: Service, image: torch.Tensor) -> None:

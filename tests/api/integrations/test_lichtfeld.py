@@ -17,7 +17,7 @@ import pytest
 
 from api.integrations.build import build
 from sgsst_core.files.scene_file import read_scene
-from tests.api.integrations.lichtfeld_stand_in import Studio, Tensor, Ui
+from tests.api.integrations.lichtfeld_stand_in import Studio, Ui
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import wall
 
@@ -88,13 +88,6 @@ def test_panel_paints_compares_and_undoes(
     assert np.array_equal(colors(), painted)
     user.draw(amount=0.5)
     assert np.allclose(colors(), (original + painted) / 2)
-    x = np.linspace(0, 99, len(original), dtype=np.float32)
-    studio.positions = Tensor(np.stack([x, x], axis=1))
-    user.draw(amount=1.0, wipe=0.25)
-    assert np.array_equal(colors(), np.where((x < 25)[:, None, None], original, painted))
-    studio.positions = Tensor(np.zeros((3, 2), np.float32))
-    user.draw(wipe=0.5)
-    assert user.texts[-1] == "Hide all splats but Splat to wipe."
 
 
 def test_colors_appear_while_they_are_being_painted(

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[3]
 FOLDER = Path(os.environ.get("SGSST_WINE", "/var/tmp/sgsst-windows"))
 #: Modules that are for the service, which does not run on Windows, and for GPUs, for which Triton has another package.
-ELSEWHERE = ("api.cli.supervisor", "triton")
+ELSEWHERE = ("triton",)
 OPTIONS = [
     "--preset",
     "preview",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from api.cli.scene_tools import error_time_table, point_line
+from api.cli.scene_tools import point_line
 from sgsst_core.bench.variants import (
     TRANSFER,
     UNSTYLIZED,
@@ -43,7 +43,6 @@ def test_initial_loss_of_zero_has_no_ratio(tmp_path: Path) -> None:
     curves = [Curve(VARIANTS["standard"], [Point(seconds, 1, None, {0: None}) for seconds in (1, 2)])]
     assert as_dict(curves)["pareto_front"] == []
     assert point_line(curves[0]) == "standard: the initial loss was 0, after 2.0 s, 1 steps"
-    assert error_time_table(curves).row_count == 1
     write_plot(tmp_path / "plot.png", curves, "black")
 
 
