@@ -43,6 +43,9 @@ _QUATERNION_TOLERANCE = 0.01
 _PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")
 #: Other camera models without a focal length.
 _NO_PINHOLES = ("ORTHOPHOTO", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
+#: Offset of a principal point from the middle of an image, relative to half its sides, above which an image counts as
+#: resized if the file gives no sizes.
+_OFF_CENTER = 0.1
 #: COLMAP's camera models with a single focal length; the others have two.
 _ONE_FOCAL = (
     *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE"),
@@ -202,6 +205,12 @@ def _transforms_intrinsics(
         raise CameraError(f"{where}: gives neither fl_x nor camera_angle_x. Add one.")
     cx = _number(where, values, "cx") if "cx" in values else size[0] / 2
     cy = _number(where, values, "cy") if "cy" in values else size[1] / 2
+    off_center = min(abs(2 * cx / size[0] - 1), abs(2 * cy / size[1] - 1)) > _OFF_CENTER
+    if off_center and not ("w" in values and "h" in values):
+        raise CameraError(
+            f"{where}: gives no size, its image has {size[0]} x {size[1]}, and its principal point is at {cx:g}, "
+            f"{cy:g}. The image seems to be resized; add the sizes of the original images as 'w' and 'h'."
+        )
     return fx, fx if fy is None else fy, cx, cy
 
 

@@ -210,6 +210,18 @@ def test_principal_points_are_read_and_null_counts_as_not_stated(tmp_path: Path)
         assert (view.width, view.fy, view.cx, view.cy) == (WIDTH, 500, WIDTH / 2, HEIGHT / 2)
 
 
+def test_size_of_a_resized_image_is_refused(tmp_path: Path) -> None:
+    content = nerfstudio(views(1))
+    del content["w"], content["h"]
+    path, image = save(tmp_path / "t.json", content), tmp_path / "images" / "img_0.png"
+    image.parent.mkdir()
+    Image.new("RGB", (WIDTH, HEIGHT)).save(image)
+    assert (read_cameras(path)[0].width, read_cameras(path)[0].fx) == (WIDTH, 500)
+    Image.new("RGB", (WIDTH // 2, HEIGHT // 2)).save(image)
+    with pytest.raises(CameraError, match=r"camera 0 .* gives no size, .*seems to be resized; add .* 'w' and 'h'"):
+        read_cameras(path)
+
+
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("place", [".", "sparse/0", "sparse/1", "sparse", "colmap/sparse/0"])
 @pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE"])
