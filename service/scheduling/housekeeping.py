@@ -55,7 +55,6 @@ class Housekeeper:
             self._searched_at = time.monotonic()
             for objects, _, name in orphans(self._store, self._artifacts, self._blobs):
                 objects.remove(name)
-            self._blobs.objects.abort_old_parts()
 
 
 def orphans(store: Store, artifacts: Artifacts, blobs: Blobs) -> Iterator[tuple[ObjectStore, What, str]]:
