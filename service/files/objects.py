@@ -350,7 +350,7 @@ class FileCache:
         """
         if self._link(sha256, target):
             return
-        with self._locked(sha256[:2]):
+        with locked(self._locks / sha256[:2]):
             if self._link(sha256, target):
                 return
             self._fill(sha256, size, target, fetch)
@@ -358,7 +358,7 @@ class FileCache:
 
     def adopt(self, source: Path, sha256: str) -> None:
         """Move a complete, verified file into the cache; if its content is already cached, `source` is deleted."""
-        with self._locked(sha256[:2]):
+        with locked(self._locks / sha256[:2]):
             if self._path(sha256).exists():
                 source.unlink()
             else:
@@ -371,7 +371,7 @@ class FileCache:
         Args:
             reserve: Bytes to leave free below the limit, and on the disk.
         """
-        with self._locked("evict"):
+        with locked(self._locks / "evict"):
             entries = sorted(self._entries(), key=lambda entry: entry[1].st_atime_ns)
             total = sum(status.st_size for _, status in entries)
             excess = reserve + max(total - self._limit, -shutil.disk_usage(self._files).free)
@@ -437,12 +437,13 @@ class FileCache:
             with contextlib.suppress(FileNotFoundError):
                 yield path, path.stat()
 
-    @contextlib.contextmanager
-    def _locked(self, name: str) -> Iterator[None]:
-        """Hold an exclusive lock against other processes and threads; the system releases it if the process dies."""
-        with (self._locks / name).open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold an exclusive lock of a file against other processes and threads; the system releases it if they die."""
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def is_full(error: BaseException | None) -> bool:

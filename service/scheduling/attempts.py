@@ -27,6 +27,7 @@ from service.files.objects import Artifacts
 from service.inputs import CHECKPOINT, PLAN, job_spec, layout, stage, stored_parameters
 from service.inspection.inspector import stored_plan
 from service.problems import LeaseLostError, ServiceError, StoreError
+from service.scheduling.attempt_files import PATIENCE_SECONDS, Publisher, fetch_checkpoint, store_weights
 from service.scheduling.capacity import Grant
 from service.scheduling.messages import (
     Ending,
@@ -38,8 +39,6 @@ from service.scheduling.messages import (
     cause_of_error,
     outage,
 )
-from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
-from service.scheduling.rank_folder import fetch_checkpoint, store_weights
 from service.settings import ServiceSettings
 from service.states import AttemptOutcome, Cause, JobStatus, Published
 from service.store import Store

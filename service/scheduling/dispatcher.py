@@ -187,7 +187,6 @@ class Dispatcher:
             if is_dead(name):
                 _log.info("taking over jobs of a dead dispatcher: name=%s", name)
                 self._store.leases.expire(name)
-                self._store.operations.remove_dispatcher(name)
         if self._work.parent.is_dir():
             for path in self._work.parent.iterdir():
                 if is_dead(path.name):

@@ -22,7 +22,7 @@ from service.files.blobs import Blobs, open_blobs
 from service.files.objects import Artifacts, ObjectStore
 from service.inputs import CHECKPOINT
 from service.problems import NotFoundError
-from service.scheduling.publishing import sweep
+from service.scheduling.attempt_files import sweep
 from service.settings import ServiceSettings
 from service.states import UNFINISHED
 from service.store import Store

@@ -21,7 +21,7 @@ from worker.job import JobSpec, Result, scene_bytes
 from worker.ranks.rank import Stored
 
 if TYPE_CHECKING:
-    from service.scheduling.rank_folder import RankFolder
+    from service.scheduling.attempt_files import RankFolder
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class StoreWorkplace:
         Raises:
             InfrastructureError: If the store is unreachable or has lost a file, or the disk is full.
         """
-        from service.scheduling.rank_folder import RankFolder
+        from service.scheduling.attempt_files import RankFolder
 
         try:
             return RankFolder(self, rank, stored)
@@ -72,7 +72,7 @@ class StoreWorkplace:
 
     def tidy(self) -> None:
         """Remove folders of dead ranks on this machine."""
-        from service.scheduling.rank_folder import remove_leftovers
+        from service.scheduling.attempt_files import remove_leftovers
 
         remove_leftovers()
 

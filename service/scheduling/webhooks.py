@@ -21,7 +21,7 @@ from service.outgoing import parse_url, send
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import PROGRESS_MESSAGE
-from service.store.operations import Delivery
+from service.store.queue import Delivery
 
 #: Delays before further attempts in seconds: the schedule that Standard Webhooks suggests, up to a day.
 _RETRY_SECONDS = (5.0, 300.0, 1800.0, 7200.0, 18_000.0, 36_000.0)

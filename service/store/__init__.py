@@ -6,10 +6,9 @@ from service.deadlines import until_answered
 from service.settings import ServiceSettings
 from service.store.database import ANSWER_SECONDS, Clock, Database
 from service.store.files import InputRows
-from service.store.jobs import Jobs, ShareLinks
+from service.store.jobs import Jobs, Retention, ShareLinks
 from service.store.keys import Keys, Sessions
-from service.store.operations import Operations, Retention
-from service.store.queue import Leases, RetryPolicy
+from service.store.queue import Leases, Operations, RetryPolicy
 
 
 class Store:

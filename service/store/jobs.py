@@ -1,4 +1,4 @@
-"""Jobs of users: create, list, rename, finish, cancel, retry, delete; their inputs, files, events, history and shares.
+"""Jobs of users, from creation to expiry, with their inputs, files, events, history and shares.
 
 Changes that dispatchers make too are functions that run within the caller's transaction. Every transaction takes its
 locks in one order, so that no two wait for each other: the owner's limits, uploads by id, jobs by id, then the rows of
@@ -32,6 +32,7 @@ from sqlalchemy import (
     select,
     text,
     tuple_,
+    update,
 )
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
@@ -40,6 +41,7 @@ from service import problems
 from service.states import (
     ACTIONS,
     ENDED,
+    FINISHED,
     UNFINISHED,
     JobStatus,
     Published,
@@ -48,15 +50,18 @@ from service.states import (
     allowed,
     next_status,
 )
-from service.store.database import Database, count, idempotency_row, new_id, upsert
+from service.store.database import IDEMPOTENCY_SECONDS, Database, count, idempotency_row, new_id, upsert
 from service.store.files import close_receipt, release_blobs
 from service.store.keys import NO_QUOTAS, Quotas, add_usage, check_bytes, count_job, digest, lock_owner
 from service.store.tables import (
     ArtifactRow,
     AttemptRow,
     Base,
+    BlobUseRow,
     DeliveryRow,
+    DispatcherRow,
     EventRow,
+    IdempotencyRow,
     JobRow,
     KeyRow,
     ProgressPointRow,
@@ -768,3 +773,55 @@ class ShareLinks:
             if row.expires_at <= self._database.clock() or job.status != JobStatus.SUCCEEDED or revoked:
                 raise problems.NO_SHARE()
             return Shared(row, job)
+
+
+#: Time in seconds after which a dispatcher without heartbeat is forgotten.
+_FORGET_SECONDS = 86_400.0
+
+
+class Retention:
+    """Housekeeping of the store, which any dispatcher may do.
+
+    Args:
+        retention: Most seconds until results expire (`retention_of`); the record of an expired job is deleted after
+            another such period.
+    """
+
+    def __init__(self, database: Database, retention: float) -> None:
+        self._database = database
+        self._retention = retention
+
+    def expire(self) -> list[str]:
+        """Expire old results, and delete the records of jobs that expired long ago.
+
+        Returns:
+            Ids of jobs whose files are to be removed.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            old = select(JobRow).where(JobRow.expires_at < now).order_by(JobRow.id).limit(100)
+            due = session.scalars(old.with_for_update(skip_locked=True)).all()
+            for job in due:
+                if job.status == JobStatus.EXPIRED:
+                    forget(session, job)
+                    continue
+                job.expires_at = now + retention_of(job, self._retention)
+                session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
+                # blobs without other holders are collected later
+                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))
+                move(session, job, Transition.EXPIRE, now)
+            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
+            session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
+            return [job.id for job in due]
+
+    def unswept(self, limit: int) -> list[tuple[str, int]]:
+        """Return ended jobs that may have files without database rows, each with the epoch of its last lease."""
+        query = select(JobRow.id, JobRow.lease_epoch).where(JobRow.swept.is_(False), JobRow.status.in_(FINISHED))
+        with self._database.reading() as session:
+            return [(job_id, epoch) for job_id, epoch in session.execute(query.limit(limit))]
+
+    def mark_swept(self, job_id: str, epoch: int) -> None:
+        """Mark a job as having no files without rows, unless it has been queued again."""
+        same = and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(FINISHED))
+        with self._database.writing() as session:
+            session.execute(update(JobRow).where(same).values(swept=True))

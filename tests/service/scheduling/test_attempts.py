@@ -17,10 +17,10 @@ from service import problems
 from service.files.objects import Artifacts
 from service.problems import NoSpaceError
 from service.scheduling import attempt_process
+from service.scheduling.attempt_files import Outbox, Publisher
 from service.scheduling.attempt_process import failure, report_prepared, report_progress
 from service.scheduling.attempts import progress_seconds
 from service.scheduling.messages import Ending, Report, StopRequest, attempt_ending, cause_of_error, outage
-from service.scheduling.publishing import Outbox, Publisher
 from service.settings import ServiceSettings
 from service.states import AttemptOutcome, Cause
 from service.store import Store

@@ -20,7 +20,7 @@ from safetensors.numpy import save_file
 from service.files.objects import Artifacts
 from service.inputs import CHECKPOINT
 from service.problems import LostFileError, StoreError
-from service.scheduling import publishing, rank_folder
+from service.scheduling import attempt_files
 from service.scheduling.messages import StoreWorkplace
 from service.states import Published
 from sgsst_core.errors import InfrastructureError
@@ -35,9 +35,8 @@ def s3(s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
     assert httpx2.put(f"{s3_url}/files").status_code == 200
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "node"))
     monkeypatch.setenv("SGSST_CACHE", os.environ.get("SGSST_CACHE", ""))
-    monkeypatch.setattr(rank_folder, "_SCAN_SECONDS", 0.05)
-    monkeypatch.setattr(rank_folder, "_RETRY_SECONDS", 0.1)
-    monkeypatch.setattr(publishing, "_RETRY_SECONDS", 0.1)
+    monkeypatch.setattr(attempt_files, "_SCAN_SECONDS", 0.05)
+    monkeypatch.setattr(attempt_files, "_RETRY_SECONDS", 0.1)
     with FaultyS3(s3_url) as faulty:
         for name, value in environment_of(faulty.origin).items():
             monkeypatch.setenv(name, value)
@@ -199,9 +198,9 @@ def test_weights_are_fetched_by_digest(
 ) -> None:
     monkeypatch.setenv("SGSST_CACHE", str(tiny_cache))
     expected = load_network_weights("vgg16").sha256
-    weights = rank_folder.store_weights(Artifacts(job.url).objects)
+    weights = attempt_files.store_weights(Artifacts(job.url).objects)
     assert "vgg16.safetensors" in [file.name for file in weights]
-    assert rank_folder.store_weights(Artifacts(job.url).objects) == weights
+    assert attempt_files.store_weights(Artifacts(job.url).objects) == weights
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "nothing is installed here"))
     rank = replace(job, weights=weights).open(1, Recorder())
     assert os.environ["SGSST_CACHE"] != str(tiny_cache)
