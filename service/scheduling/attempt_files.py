@@ -93,9 +93,15 @@ class Outbox:
         files = {RESULT: self._out / RESULT} | {name: self._out / file for name, file in _RESULTS.items()}
         return {name: path for name, path in files.items() if path.is_file()}
 
-    def put(self, files: Mapping[str, Path]) -> tuple[list[Published], ServiceError | None]:
-        """Upload new and changed files; return them, and the error that stopped the upload (None for no error)."""
-        done = []
+    def put(self, files: Mapping[str, Path], stored: Callable[[Published], None]) -> None:
+        """Upload new and changed files.
+
+        Args:
+            stored: Callback that receives each file once it is stored.
+
+        Raises:
+            StoreError, NoSpaceError: If the file store rejects a file.
+        """
         for name, path in files.items():
             with contextlib.suppress(FileNotFoundError):
                 status = path.stat()
@@ -105,13 +111,9 @@ class Outbox:
                 # later checkpoints and colors replace the file instead of overwriting it; results are never rewritten
                 final = name == CHECKPOINT or name in RESULTS or name.startswith(LIVE)
                 step = _saved_step(path) if name == CHECKPOINT else None
-                try:
-                    file = self._artifacts.put(self._job_id, self._epoch, name, path, final=final)
-                    done.append(replace(file, step=step))
-                except (StoreError, NoSpaceError) as error:
-                    return done, error
+                file = self._artifacts.put(self._job_id, self._epoch, name, path, final=final)
                 self._uploaded[name] = stamp
-        return done, None
+                stored(replace(file, step=step))
 
 
 def _saved_step(checkpoint: Path) -> int | None:
@@ -154,19 +156,15 @@ class Publisher:
         """
         if time.monotonic() - self._refused_at < _RETRY_SECONDS and not whole_log:
             return
-        refused: ServiceError | None
-        put: list[Published]
+        put: list[Published] = []
         try:
             with disk_errors():
                 files = self._outbox.unfinished() | self._grown_log(now=whole_log)
-        except (StoreError, NoSpaceError) as error:  # there is no space for a copy of the log
-            put, refused = [], error
-        else:
-            put, refused = self._outbox.put(files)
-        self.publish(put)
-        if refused is not None:
+            self._outbox.put(files, put.append)
+        except (StoreError, NoSpaceError) as error:
             self._refused_at = time.monotonic()
-            _log.warning("upload failed, retrying: %s", _reason(refused), extra=self._lease.log_fields)
+            _log.warning("upload failed, retrying: %s", _reason(error), extra=self._lease.log_fields)
+        self.publish(put)
 
     def publish(self, files: Sequence[Published]) -> None:
         """Make stored files visible, except for results, which become visible at the end."""
@@ -236,17 +234,17 @@ def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Publishe
     started = time.monotonic()
     done: list[Published] = []
     while True:
-        put, refused = outbox.put(outbox.results())
-        done += put
-        if refused is None:
+        try:
+            outbox.put(outbox.results(), done.append)
             return done
-        if given_up() or time.monotonic() - started > PATIENCE_SECONDS:
-            raise refused
-        _log.warning("upload of results failed, retrying: %s", _reason(refused))
+        except (StoreError, NoSpaceError) as error:
+            if given_up() or time.monotonic() - started > PATIENCE_SECONDS:
+                raise
+            _log.warning("upload of results failed, retrying: %s", _reason(error))
         time.sleep(_RETRY_SECONDS)
 
 
-def _reason(error: ServiceError) -> str:
+def _reason(error: Exception) -> str:
     """Return an error with its cause, for the operator."""
     cause = error.__cause__
     return f"{error} ({type(cause).__name__}: {cause})" if cause is not None else str(error)
@@ -344,33 +342,29 @@ class _Uploader:
     def _run(self) -> None:
         while not self._stop.wait(_SCAN_SECONDS):
             try:
-                refused = self._upload()
-            except Exception:  # the job continues whatever the error is
-                _log.exception("upload failed, retrying")
-                refused = None
-            if refused is not None:
-                _log.warning("upload failed, retrying: %s", _reason(refused))
+                self._upload()
+            except Exception as error:  # the job continues whatever the error is
+                is_bug = not isinstance(error, ServiceError)
+                _log.warning("upload failed, retrying: %s", _reason(error), exc_info=is_bug)
                 self._stop.wait(_RETRY_SECONDS)
 
-    def _upload(self) -> ServiceError | None:
-        put, refused = self._outbox.put(self._outbox.unfinished())
-        self._report(put)
-        return refused
+    def _upload(self) -> None:
+        self._outbox.put(self._outbox.unfinished(), self._report)
 
-    def _report(self, files: Sequence[Published]) -> None:
-        for file in files:
-            self._stored(file, file.step)
+    def _report(self, file: Published) -> None:
+        self._stored(file, file.step)
 
     def finish(self, *, done: bool) -> None:
         self.stop()
         if done:
-            self._report(put_patiently(self._outbox, lambda: False))
-        refused = self._upload()
-        if refused is not None and not done:
-            time.sleep(_RETRY_SECONDS)
-            refused = self._upload()
-            if refused is not None:
-                raise refused
+            for file in put_patiently(self._outbox, lambda: False):
+                self._report(file)
+        try:
+            self._upload()
+        except (StoreError, NoSpaceError):
+            if not done:
+                time.sleep(_RETRY_SECONDS)
+                self._upload()
 
     def stop(self) -> None:
         self._stop.set()

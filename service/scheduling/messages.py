@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import re
 import signal
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -15,7 +16,15 @@ from pydantic import BaseModel
 from service.inputs import CHECKPOINT
 from service.problems import DatabaseUnavailableError, NoSpaceError, StoreError
 from service.states import AttemptOutcome, Cause, Published
-from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
+from sgsst_core.errors import (
+    DivergedError,
+    InfrastructureError,
+    InvalidInputError,
+    OutputError,
+    SgsstError,
+    WeightsError,
+    is_out_of_memory,
+)
 from sgsst_core.progress import Progress
 from worker.job import JobSpec, Result, scene_bytes
 from worker.ranks.rank import Stored
@@ -160,6 +169,19 @@ class Ending:
     error: dict[str, Any] | None = None
     permanent: bool = False
     detail: str | None = None
+
+
+def failure(error: Exception) -> Ending:
+    """Return the ending for an error; the error is permanent if a retry would fail in the same way."""
+    cause = cause_of_error(error)
+    if cause != Cause.JOB:
+        detail = "".join(traceback.format_exception(error))
+        return Ending(AttemptOutcome.FAILED, error=outage(cause), detail=detail)
+    code, message = "internal", f"{type(error).__name__}: {error}"
+    if isinstance(error, SgsstError) or is_out_of_memory(error):
+        code, message = error.code if isinstance(error, SgsstError) else "out-of-memory", str(error)
+    permanent = isinstance(error, InvalidInputError | DivergedError)
+    return Ending(AttemptOutcome.FAILED, error={"code": code, "message": message}, permanent=permanent)
 
 
 class Report(BaseModel):

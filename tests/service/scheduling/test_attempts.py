@@ -18,11 +18,11 @@ from service.files.objects import Artifacts
 from service.problems import NoSpaceError
 from service.scheduling import attempt_process
 from service.scheduling.attempt_files import Outbox, Publisher
-from service.scheduling.attempt_process import failure, report_prepared, report_progress
+from service.scheduling.attempt_process import report_prepared, report_progress
 from service.scheduling.attempts import progress_seconds
-from service.scheduling.messages import Ending, Report, StopRequest, attempt_ending, cause_of_error, outage
+from service.scheduling.messages import Ending, Report, StopRequest, attempt_ending, cause_of_error, failure, outage
 from service.settings import ServiceSettings
-from service.states import AttemptOutcome, Cause
+from service.states import AttemptOutcome, Cause, Published
 from service.store import Store
 from service.store.queue import Lease, cause_of
 from sgsst_core.errors import (
@@ -200,14 +200,16 @@ def test_full_disk_delays_publishing(folder: Path, settings: ServiceSettings) ->
     (folder / "out" / "stylized.views.jpg").write_bytes(bytes(1 << 20))
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, hard))
+    put: list[Published] = []
     try:
-        put, refused = outbox.put(outbox.unfinished())
+        with pytest.raises(NoSpaceError):
+            outbox.put(outbox.unfinished(), put.append)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert (put, type(refused)) == ([], NoSpaceError)
+    assert put == []
     assert stored_names(settings) == []
-    put, refused = outbox.put(outbox.unfinished())
-    assert ([file.name for file in put], refused) == (["views.jpg"], None)
+    outbox.put(outbox.unfinished(), put.append)
+    assert [file.name for file in put] == ["views.jpg"]
 
 
 def content(store: Store, settings: ServiceSettings, lease: Lease, name: str) -> bytes:
