@@ -69,7 +69,7 @@ class ServiceSettings(BaseSettings):
     max_views: int = Field(2_000, gt=0)
     max_pixels: int = Field(20_000_000_000, gt=0)
     max_image_pixels: int = Field(100_000_000, gt=0)
-    max_photos: int = Field(2_000, gt=0)
+    max_photos: int = Field(2_000, gt=0, le=30_000)  # SQLite's statements have at most 32,766 values
     max_jobs_per_key: int = Field(100, gt=0)
     max_jobs_a_day_per_key: int | None = Field(None, ge=0)
     max_gpu_seconds_a_day_per_key: float | None = Field(None, ge=0)

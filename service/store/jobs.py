@@ -609,18 +609,16 @@ class Jobs:
         owner: str,
         quotas: Quotas = NO_QUOTAS,
         *,
-        replace: bool = False,
         receipt: str | None = None,
     ) -> list[str]:
-        """Publish files derived from `source`, unless `source` has been removed or replaced.
+        """Publish files derived from `source`, replacing those of the same names, unless `source` is gone.
 
         Args:
             source: Row of the file that they were derived from.
-            replace: Whether files replace those of the same names, instead of being left out.
             receipt: Receipt that the owner was charged by before the files were stored; the files take it over.
 
         Returns:
-            Locations of files without a row: replaced ones, and those that were left out or whose `source` is gone.
+            Locations of files without a row: replaced ones, and those whose `source` is gone or replaced.
 
         Raises:
             QUOTA_EXCEEDED: If the files exceed the owner's quota of stored bytes; none is published.
@@ -631,10 +629,10 @@ class Jobs:
             session.get(JobRow, source.job_id, with_for_update=True)  # before its files, as everybody else
             row = session.get(ArtifactRow, (source.job_id, source.name))
             for file in files:
-                existing = session.get(ArtifactRow, (source.job_id, file.name))
-                if row is None or row.location != source.location or (existing is not None and not replace):
+                if row is None or row.location != source.location:
                     unused.append(file.location)
                     continue
+                existing = session.get(ArtifactRow, (source.job_id, file.name))
                 if existing is not None:
                     unused.append(existing.location)
                     session.delete(existing)
