@@ -1,8 +1,8 @@
 """Files of an attempt: staged for its ranks, published while it runs, and its results at its end.
 
 Ranks stage them themselves on machines that share only the file store with the dispatcher (`StoreWorkplace`). Settings
-come from such a machine itself: the environment of its Ray node defines the data folder (`SGSST_DATA`, a temporary
-folder by default), the size of the cache, and the credentials of the store.
+come from such a machine itself: the environment of its Ray node defines the data folder (`SGSST_DATA`), the size of the
+cache, and the credentials of the store.
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ import os
 import secrets
 import shutil
 import socket
-import stat
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -210,13 +208,6 @@ class Publisher:
         self.publish(put_patiently(self._outbox, given_up))
         self._store.leases.succeed(self._lease, list(self._results.values()), result)
 
-    def sweep(self) -> None:
-        """Remove leftovers of all attempts at the ended job; housekeeping repeats it if it fails."""
-        try:
-            sweep(self._store, self._artifacts, self._lease.job_id, self._lease.epoch)
-        except StoreError as error:
-            _log.warning("leftover files not deleted yet: %s", _reason(error), extra=self._lease.log_fields)
-
     def log_tail(self) -> str | None:
         """Return the end of the log; None if there is no log."""
         try:
@@ -402,23 +393,14 @@ def _digest(path: Path, _size: int, _changed: int) -> str:
 
 
 def node_settings() -> ServiceSettings:
-    """Return the settings of this machine; the data folder is temporary unless the environment defines one.
+    """Return the settings of this machine.
 
     Raises:
-        InfrastructureError: If other users have made the temporary folder, or can change it.
+        InfrastructureError: If its environment names no data folder.
     """
-    if os.environ.get("SGSST_DATA"):
-        return read_settings()
-    folder = Path(tempfile.gettempdir()) / f"sgsst-{os.getuid()}"
-    with contextlib.suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
-    status = folder.lstat()
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
-        raise InfrastructureError(
-            f"{folder} on {socket.gethostname()} is no folder that only this user can write to. Delete it, or set "
-            "SGSST_DATA there."
-        )
-    return ServiceSettings(data=folder)
+    if not os.environ.get("SGSST_DATA"):
+        raise InfrastructureError(f"{socket.gethostname()} has no SGSST_DATA. Set it to a folder before `ray start`.")
+    return read_settings()
 
 
 def remove_leftovers() -> None:

@@ -26,7 +26,7 @@ from service.files.blobs import Blobs
 from service.files.objects import Artifacts
 from service.inputs import CHECKPOINT, PLAN, job_spec, layout, stage, stored_parameters
 from service.inspection.inspector import stored_plan
-from service.problems import LeaseLostError, StoreError
+from service.problems import LeaseLostError
 from service.scheduling.attempt_files import PATIENCE_SECONDS, Publisher, fetch_checkpoint, store_weights
 from service.scheduling.capacity import Grant
 from service.scheduling.messages import (
@@ -339,10 +339,8 @@ class RunningAttempt:
             result = {} if ending.result is None else ending.result.model_dump()
             succeed = partial(self._publisher.succeed, result, lambda: self._stop_request == StopRequest.ABANDON)
             self._within(succeed, 2 * PATIENCE_SECONDS)
-            self._sweep()
         elif ending.outcome == AttemptOutcome.CANCELED:
             self._store.leases.stop(self.lease)
-            self._sweep()
         elif ending.outcome == AttemptOutcome.RELEASED:
             self._store.leases.release(self.lease)
         else:
@@ -396,13 +394,6 @@ class RunningAttempt:
         retried = self._store.leases.fail(self.lease, error, permanent=permanent)
         outcome = "job will be retried" if retried else "job failed"
         _log.warning("%s: cause=%s: %s", outcome, cause_of(error), error["message"], extra=self.lease.log_fields)
-        if not retried:
-            self._sweep()
-
-    def _sweep(self) -> None:
-        """Remove leftovers of the ended job; housekeeping removes those that remain."""
-        with contextlib.suppress(StoreError):
-            self._within(self._publisher.sweep)
 
 
 class ProgressWriter:

@@ -1,6 +1,6 @@
 """Agreement of files and database: periodic housekeeping by dispatchers, and the check and repair by `sgsst fsck`.
 
-Files of failed attempts are swept when their job ends. Orphaned files come from interrupted attempts that stored
+Files of failed attempts are swept once their job has ended. Orphaned files come from interrupted attempts that stored
 another file after the job had already ended elsewhere, and from processes that died. Both are safe while the service is
 running.
 """
@@ -31,7 +31,7 @@ from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, UploadR
 
 #: Interval between searches for orphaned files, in seconds.
 _SEARCH_SECONDS = 3600.0
-#: Maximum number of jobs whose leftover files are removed per round.
+#: Maximum number of jobs whose leftover files are looked for at a time.
 _MAX_SWEEPS = 20
 #: Description of a file.
 What = Literal["input", "result", "checkpoint", "upload"]
@@ -48,8 +48,9 @@ class Housekeeper:
         """Delete what has expired, and from time to time orphaned files."""
         for job_id in self._store.retention.expire():
             self._artifacts.objects.remove_below(job_id)
-        for job_id, epoch in self._store.retention.unswept(_MAX_SWEEPS):
-            sweep(self._store, self._artifacts, job_id, epoch)
+        while ended := self._store.retention.unswept(_MAX_SWEEPS):
+            for job_id, epoch in ended:
+                sweep(self._store, self._artifacts, job_id, epoch)
         self._blobs.collect()
         if time.monotonic() - self._searched_at > _SEARCH_SECONDS:
             self._searched_at = time.monotonic()

@@ -10,6 +10,9 @@ from service.store.jobs import Jobs, Retention, ShareLinks
 from service.store.keys import Keys, Sessions
 from service.store.queue import Leases, Operations, RetryPolicy
 
+#: Seconds of a day.
+_DAY = 86_400.0
+
 
 class Store:
     """Complete store on one database; `clock` and `answer_seconds` are passed to `Database`."""
@@ -18,13 +21,14 @@ class Store:
         self, settings: ServiceSettings, clock: Clock | None = None, answer_seconds: float = ANSWER_SECONDS
     ) -> None:
         self.database = Database(settings.database_url, clock, answer_seconds)
-        self.jobs = Jobs(self.database, settings.retention_seconds)
+        retention = settings.retention_days * _DAY
+        self.jobs = Jobs(self.database, retention)
         policy = RetryPolicy(settings.max_attempts, settings.retry_seconds)
-        self.leases = Leases(self.database, settings.lease_seconds, policy, settings.retention_seconds)
-        self.retention = Retention(self.database, settings.retention_seconds)
+        self.leases = Leases(self.database, settings.lease_seconds, policy, retention)
+        self.retention = Retention(self.database, retention)
         self.inputs = InputRows(self.database)
         self.keys = Keys(self.database)
-        self.sessions = Sessions(self.database, settings.session_seconds)
+        self.sessions = Sessions(self.database, settings.session_days * _DAY)
         self.shares = ShareLinks(self.database)
         self.operations = Operations(self.database, settings.lease_seconds)
 

@@ -24,7 +24,6 @@ from sqlalchemy.orm import Session
 from service import problems
 from service.problems import DatabaseUnavailableError, ServiceError
 from service.store.tables import Base, CounterRow, IdempotencyRow
-from sgsst_core.errors import SettingsError
 
 #: Time in seconds that a transaction waits for a probing transaction before it is rejected.
 _PROBE_SECONDS = 0.2
@@ -141,8 +140,6 @@ Clock = Callable[[], float]
 
 #: Version of the newest migration; a database with this version is opened without loading the migrations.
 SCHEMA = "0013"
-#: Version of the first migration; databases of earlier development versions cannot be migrated.
-_FIRST = "0010"
 MIGRATIONS = Path(__file__).with_name("migrations")
 #: Default timeout in seconds of each wait of a transaction: for the write lock, a connection, and each response.
 ANSWER_SECONDS = 30.0
@@ -277,17 +274,9 @@ class Database:
 
         Tables of a later version are used as they are. Later migrations only add to the schema, so processes of this
         version keep working, and can be restarted, while they are replaced one by one.
-
-        Raises:
-            SettingsError: If the tables are those of an earlier development version.
         """
         if self.is_up_to_date():
             return
-        if (version := self._version()) and version < _FIRST:
-            raise SettingsError(
-                f"{self.url}: is a database of an earlier development version ({version}), which cannot be migrated. "
-                "Use another data folder or database; the earlier version can still open this one."
-            )
         engine = self._make_engine(None)  # creating an index may take long
         try:
             with translated(), self._upgrading(engine):

@@ -378,13 +378,13 @@ class Leases:
 
     # --- the end of an attempt -------------------------------------------------------------------------------------
 
-    def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any]) -> list[str]:
-        """End a job as succeeded and publish its results in one transaction, as `publish` does.
+    def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any]) -> None:
+        """End a job as succeeded and publish its results in one transaction; replaced files are swept.
 
         If a cancellation came too late, the job still counts as succeeded.
         """
         with self._held(lease) as (session, job, now):
-            unused = _publish(session, job, files, now)
+            _publish(session, job, files, now)
             # the colors of the unfinished job, and its checkpoint unless it can be continued
             prefixes = (LIVE,) if result.get("stopped") in CONTINUABLE else (".", LIVE)
             obsolete = or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in prefixes))
@@ -396,7 +396,6 @@ class Leases:
             _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
             observe(session, "sgsst_job_seconds", max(0.0, now - (job.started_at or now)))
             end(session, job, Transition.SUCCEED, now, self._retention)
-            return unused
 
     def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool) -> bool:
         """End a failed attempt: the job is queued again after a delay, or fails.

@@ -3,7 +3,6 @@
 import multiprocessing
 import os
 import pickle
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -96,33 +95,11 @@ def test_files_are_fetched_once_for_all_ranks_of_a_machine(s3: FaultyS3, job: St
     assert not [path for path in (tmp_path / "node" / "ranks").iterdir() if path.is_dir()]
 
 
-@pytest.mark.parametrize("kind", ["link", "writable", "file"])
-def test_temporary_folder_of_others_is_refused(
-    kind: str, job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its content is neither used nor deleted."""
+def test_machine_without_a_data_folder_is_refused(job: StoreWorkplace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SGSST_DATA")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    other, folder = tmp_path / "other", tmp_path / f"sgsst-{os.getuid()}"
-    (other / "ranks" / "old").mkdir(parents=True)
-    if kind == "link":
-        folder.symlink_to(other)
-    elif kind == "writable":
-        other.rename(folder)
-        folder.chmod(0o777)
-    else:
-        folder.touch()
-    with pytest.raises(InfrastructureError, match="only this user can write to"):
+    with pytest.raises(InfrastructureError, match="has no SGSST_DATA"):
         job.open(1, Recorder())
     job.tidy()
-    assert kind == "file" or (folder / "ranks" / "old").is_dir()
-
-
-def test_temporary_folder_is_private(job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("SGSST_DATA")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    job.open(1, Recorder()).close()
-    assert (tmp_path / f"sgsst-{os.getuid()}").stat().st_mode & 0o777 == 0o700
 
 
 def test_first_rank_uploads_files_while_it_runs(job: StoreWorkplace) -> None:

@@ -17,7 +17,7 @@ from service import problems
 from service.files.objects import Artifacts
 from service.problems import NoSpaceError
 from service.scheduling import attempt_process
-from service.scheduling.attempt_files import Outbox, Publisher
+from service.scheduling.attempt_files import Outbox, Publisher, sweep
 from service.scheduling.attempt_process import report_prepared, report_progress
 from service.scheduling.attempts import progress_seconds
 from service.scheduling.messages import Ending, Report, StopRequest, attempt_ending, cause_of_error, failure, outage
@@ -255,7 +255,7 @@ def test_live_colors_are_published_until_the_job_has_succeeded(
     assert stored_names(settings).count("colors.f16") == 1, "the older one is still there"
     (folder / "out" / "stylized.ply").write_bytes(b"ply")
     publisher.succeed({})
-    publisher.sweep()
+    sweep(store, Artifacts(settings.artifacts_url), lease.job_id, lease.epoch)
     assert stored_names(settings) == ["log.txt", "stylized.ply"]
     assert [row.name for row in store.jobs.artifacts(lease.job_id)] == ["log.txt", "stylized.ply"]
 
@@ -297,7 +297,7 @@ def test_success_publishes_results_and_sweeps_leftovers(
     Artifacts(settings.artifacts_url).put(lease.job_id, lease.epoch, "cut_off.jpg", folder / "log.txt")
     assert publisher.has_result()
     publisher.succeed({"steps": 1})
-    publisher.sweep()
+    sweep(store, Artifacts(settings.artifacts_url), lease.job_id, lease.epoch)
     job = store.jobs.get(lease.job_id, None)
     assert (job.status, job.result) == ("succeeded", {"steps": 1})
     names = ["log.txt", "loss.png", "report.json", "stylized.ply"]
