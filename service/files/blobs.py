@@ -276,7 +276,6 @@ class BlobFolder(Blobs):
         else:
             known.parent.mkdir(exist_ok=True)
             final.replace(known)
-            final.unlink(missing_ok=True)  # renaming one of two hard links to the other is a no-op
             flush_folder(known.parent)
         return sha256
 

@@ -357,12 +357,9 @@ class FileCache:
         self.evict()
 
     def adopt(self, source: Path, sha256: str) -> None:
-        """Move a complete, verified file into the cache; if its content is already cached, `source` is deleted."""
+        """Move a complete, verified file into the cache."""
         with locked(self._locks / sha256[:2]):
-            if self._path(sha256).exists():
-                source.unlink()
-            else:
-                self._add(source, sha256)
+            self._add(source, sha256)
         self.evict()
 
     def evict(self, reserve: int = 0) -> None:

@@ -246,7 +246,6 @@ class Inspector:
         self._settings = settings
         self._store, self._blobs, self._threads = store, blobs, threads
         self.processes = Processes(settings)
-        self._warming: asyncio.Task[None] | None = None
         self._folder = working_folder(settings, "inspections")
         for feature in missing():
             _log.warning("confinement incomplete: missing %s", feature)
@@ -297,8 +296,6 @@ class Inspector:
         kind: Kind = "plan" if work == "plan" else "large" if _size(inputs) > _LARGE_BYTES else "validate"
         with suspended():  # the process has its own limits
             async with self.processes.turn(owner, kind) as process:
-                if self._settings.keys_required and self._warming is None:  # without keys there is only one owner
-                    self._warming = asyncio.create_task(self.processes.warm())
                 answer = await self._ask_process(process, work, owner, inputs, rows, parameters, seconds, show)
         transient = answer.get("error", {}).get("code") in (problems.INSPECTION_LIMIT.code, WeightsError.code)
         if not transient:  # a later check may succeed

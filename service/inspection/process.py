@@ -445,22 +445,17 @@ def _compile_kernels() -> None:
         _close_descriptors()
         with tempfile.TemporaryDirectory() as folder:
             os.chdir(folder)
-            count, scene = 64, Path("scene.ply")
+            scene = Path("scene.ply")
             shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh_dc": (3,), "sh_rest": (15, 3)}
-            write_scene(scene, Scene(*(torch.rand(count, *shape) for shape in shapes.values())))
-            staged, parameters = (
-                Staged(scene=scene, styles=(STARRY_NIGHT,), cameras=None, photos=None),
-                JobParameters(orbit="3", resolution=96),
-            )
-            limits = dict.fromkeys(("gaussians", "views", "pixels", "image_pixels"), 1 << 40)
+            write_scene(scene, Scene(*(torch.rand(64, *shape) for shape in shapes.values())))
             request = WorkRequest(
                 work="plan",
                 folder=Path(folder),
-                staged=staged,
-                parameters=parameters,
+                staged=Staged(scene=scene, styles=(STARRY_NIGHT,), cameras=None, photos=None),
+                parameters=JobParameters(orbit="3", resolution=96),
                 seconds=0,
                 memory=0,
-                limits=limits,
+                limits=dict.fromkeys(("gaussians", "views", "pixels", "image_pixels"), 1 << 40),
             )
             _plan(request, lambda response: None)
     finally:

@@ -324,12 +324,9 @@ class Database:
         elif self.sqlite:
             yield
         else:
-            with engine.connect() as connection:
-                connection.execute(text("SELECT pg_advisory_lock(:lock)"), {"lock": _LOCK})
-                try:
-                    yield
-                finally:
-                    connection.execute(text("SELECT pg_advisory_unlock(:lock)"), {"lock": _LOCK})
+            with engine.begin() as connection:
+                connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
+                yield
 
 
 def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, seconds: float) -> Any:

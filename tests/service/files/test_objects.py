@@ -181,14 +181,12 @@ def test_adopted_file_is_not_copied(cache: FileCache, tmp_path: Path) -> None:
     data, sha256 = content(1)
     for name in ("first", "second"):
         (tmp_path / name).write_bytes(data)
-        inode = (tmp_path / name).stat().st_ino
+        adopted = (tmp_path / name).stat().st_ino
         cache.adopt(tmp_path / name, sha256)
         assert not (tmp_path / name).exists()
-        if name == "first":
-            first = inode
     source = Source(data)
     cache.link(sha256, 1000, tmp_path / "a", source)
-    assert ((tmp_path / "a").stat().st_ino, source.fetched) == (first, 0)
+    assert ((tmp_path / "a").stat().st_ino, source.fetched) == (adopted, 0)
 
 
 def _use(folder: str, number: int) -> None:
