@@ -248,7 +248,7 @@ def sweep(store: Store, artifacts: Artifacts, job_id: str, epoch: int) -> None:
         epoch: Epoch of the job's last lease.
     """
     artifacts.sweep(job_id, epoch, {row.location for row in store.jobs.artifacts(job_id)})
-    store.retention.mark_swept(job_id, epoch)
+    store.jobs.mark_swept(job_id, epoch)
 
 
 # --- on machines that share only the file store -------------------------------------------------------------------

@@ -46,9 +46,9 @@ class Housekeeper:
 
     def clean_up(self) -> None:
         """Delete what has expired, and from time to time orphaned files."""
-        for job_id in self._store.retention.expire():
+        for job_id in self._store.jobs.expire():
             self._artifacts.objects.remove_below(job_id)
-        while ended := self._store.retention.unswept(_MAX_SWEEPS):
+        while ended := self._store.jobs.unswept(_MAX_SWEEPS):
             for job_id, epoch in ended:
                 sweep(self._store, self._artifacts, job_id, epoch)
         self._blobs.collect()

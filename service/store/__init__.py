@@ -6,7 +6,7 @@ from service.deadlines import until_answered
 from service.settings import ServiceSettings
 from service.store.database import ANSWER_SECONDS, Clock, Database
 from service.store.files import InputRows
-from service.store.jobs import Jobs, Retention, ShareLinks
+from service.store.jobs import Jobs, ShareLinks
 from service.store.keys import Keys, Sessions
 from service.store.queue import Leases, Operations, RetryPolicy
 
@@ -25,7 +25,6 @@ class Store:
         self.jobs = Jobs(self.database, retention)
         policy = RetryPolicy(settings.max_attempts, settings.retry_seconds)
         self.leases = Leases(self.database, settings.lease_seconds, policy, retention)
-        self.retention = Retention(self.database, retention)
         self.inputs = InputRows(self.database)
         self.keys = Keys(self.database)
         self.sessions = Sessions(self.database, settings.session_days * _DAY)

@@ -302,6 +302,8 @@ _EARLIER = _QUEUED.where(
 _AHEAD = select(_HIGHER.scalar_subquery() + _EARLIER.scalar_subquery())
 
 
+#: Time in seconds after which a dispatcher without heartbeat is forgotten.
+_FORGET_SECONDS = 86_400.0
 #: Maximum number of shares of a job that have not expired.
 MOST_SHARES = 20
 _TOKEN = re.compile(r"(shr_[0-9a-f]{20,36})\.[A-Za-z0-9_-]{43}", re.ASCII)
@@ -664,6 +666,43 @@ class Jobs:
         with self._database.reading() as session:
             return dict(session.execute(query.group_by(EventRow.job_id)).all())
 
+    # --- housekeeping, which any dispatcher may do -------------------------------------------------------------------
+
+    def expire(self) -> list[str]:
+        """Expire old results, and delete the records of jobs that expired as long ago.
+
+        Returns:
+            Ids of jobs whose files are to be removed.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            old = select(JobRow).where(JobRow.expires_at < now).order_by(JobRow.id).limit(100)
+            due = session.scalars(old.with_for_update(skip_locked=True)).all()
+            for job in due:
+                if job.status == JobStatus.EXPIRED:
+                    forget(session, job)
+                    continue
+                job.expires_at = now + retention_of(job, self._retention)
+                session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
+                # blobs without other holders are collected later
+                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))
+                move(session, job, Transition.EXPIRE, now)
+            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
+            session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
+            return [job.id for job in due]
+
+    def unswept(self, limit: int) -> list[tuple[str, int]]:
+        """Return ended jobs that may have files without database rows, each with the epoch of its last lease."""
+        query = select(JobRow.id, JobRow.lease_epoch).where(JobRow.swept.is_(False), JobRow.status.in_(FINISHED))
+        with self._database.reading() as session:
+            return [(job_id, epoch) for job_id, epoch in session.execute(query.limit(limit))]
+
+    def mark_swept(self, job_id: str, epoch: int) -> None:
+        """Mark a job as having no files without rows, unless it has been queued again."""
+        same = and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(FINISHED))
+        with self._database.writing() as session:
+            session.execute(update(JobRow).where(same).values(swept=True))
+
 
 def _check_queue(session: Session, owner: str, limit: int) -> None:
     """Raise QUEUE_FULL if an owner has `limit` unfinished jobs."""
@@ -771,55 +810,3 @@ class ShareLinks:
             if row.expires_at <= self._database.clock() or job.status != JobStatus.SUCCEEDED or revoked:
                 raise problems.NO_SHARE()
             return Shared(row, job)
-
-
-#: Time in seconds after which a dispatcher without heartbeat is forgotten.
-_FORGET_SECONDS = 86_400.0
-
-
-class Retention:
-    """Housekeeping of the store, which any dispatcher may do.
-
-    Args:
-        retention: Most seconds until results expire (`retention_of`); the record of an expired job is deleted after
-            another such period.
-    """
-
-    def __init__(self, database: Database, retention: float) -> None:
-        self._database = database
-        self._retention = retention
-
-    def expire(self) -> list[str]:
-        """Expire old results, and delete the records of jobs that expired long ago.
-
-        Returns:
-            Ids of jobs whose files are to be removed.
-        """
-        now = self._database.clock()
-        with self._database.writing() as session:
-            old = select(JobRow).where(JobRow.expires_at < now).order_by(JobRow.id).limit(100)
-            due = session.scalars(old.with_for_update(skip_locked=True)).all()
-            for job in due:
-                if job.status == JobStatus.EXPIRED:
-                    forget(session, job)
-                    continue
-                job.expires_at = now + retention_of(job, self._retention)
-                session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
-                # blobs without other holders are collected later
-                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))
-                move(session, job, Transition.EXPIRE, now)
-            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
-            session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
-            return [job.id for job in due]
-
-    def unswept(self, limit: int) -> list[tuple[str, int]]:
-        """Return ended jobs that may have files without database rows, each with the epoch of its last lease."""
-        query = select(JobRow.id, JobRow.lease_epoch).where(JobRow.swept.is_(False), JobRow.status.in_(FINISHED))
-        with self._database.reading() as session:
-            return [(job_id, epoch) for job_id, epoch in session.execute(query.limit(limit))]
-
-    def mark_swept(self, job_id: str, epoch: int) -> None:
-        """Mark a job as having no files without rows, unless it has been queued again."""
-        same = and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(FINISHED))
-        with self._database.writing() as session:
-            session.execute(update(JobRow).where(same).values(swept=True))

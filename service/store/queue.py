@@ -539,23 +539,6 @@ def _close_attempt(
 _READ_ONLY = text("SHOW transaction_read_only")
 
 
-@dataclass(frozen=True)
-class Delivery:
-    """Webhook message that a dispatcher has claimed for sending.
-
-    Attributes:
-        owner: Owner of the job; empty if the job is deleted.
-        tries: Number of attempts, including this one.
-    """
-
-    id: str
-    job_id: str
-    owner: str
-    url: str
-    body: dict[str, Any]
-    tries: int
-
-
 def _counted(counts: Mapping[str, int], column: SQLColumnExpression[str]) -> ColumnElement[int]:
     """Return an SQL expression for the count of a column's value; 0 for values without a count."""
     return case(dict(counts), value=column, else_=0) if counts else literal(0)
@@ -633,9 +616,17 @@ class Operations:
             return session.get_one(SecretRow, "webhooks").value
 
     def due_deliveries(
-        self, hold_seconds: float, sending: Collection[Delivery], *, total: int, per_owner: int, per_url: int
-    ) -> list[Delivery]:
+        self,
+        hold_seconds: float,
+        sending: Collection[tuple[DeliveryRow, str]],
+        *,
+        total: int,
+        per_owner: int,
+        per_url: int,
+    ) -> list[tuple[DeliveryRow, str]]:
         """Claim due messages for sending; no other dispatcher gets them for `hold_seconds`.
+
+        Each message comes with the owner of its job, who is empty if the job is deleted, and counts this attempt.
 
         Args:
             sending: Messages that this dispatcher is already sending; they count toward the limits.
@@ -648,7 +639,7 @@ class Operations:
         due = (
             select(DeliveryRow.id, DeliveryRow.next_at, owner.label("owner"))
             .add_columns(
-                (per_url_rank + _counted(Counter(each.url for each in sending), DeliveryRow.url)).label("rank")
+                (per_url_rank + _counted(Counter(row.url for row, _ in sending), DeliveryRow.url)).label("rank")
             )
             .outerjoin(JobRow, JobRow.id == DeliveryRow.job_id)
             .where(DeliveryRow.next_at <= now)
@@ -658,7 +649,7 @@ class Operations:
         turns = (
             select(due.c.id, due.c.owner)
             .add_columns(
-                (per_owner_rank + _counted(Counter(each.owner for each in sending), due.c.owner)).label("rank")
+                (per_owner_rank + _counted(Counter(holder for _, holder in sending), due.c.owner)).label("rank")
             )
             .where(due.c.rank <= per_url)
             .subquery()
@@ -672,11 +663,10 @@ class Operations:
             .with_for_update(of=DeliveryRow, skip_locked=True)
         )
         with self._database.writing() as session:
-            taken = []
-            for row, holder in session.execute(query).all():
+            taken = [(row, holder) for row, holder in session.execute(query).all()]
+            for row, _ in taken:
                 row.tries += 1
                 row.next_at = now + hold_seconds
-                taken.append(Delivery(row.id, row.job_id, holder, row.url, row.body, row.tries))
             return taken
 
     def settle_delivery(self, delivery_id: str, wait_seconds: float | None) -> None:

@@ -303,4 +303,4 @@ def test_success_publishes_results_and_sweeps_leftovers(
     names = ["log.txt", "loss.png", "report.json", "stylized.ply"]
     assert [row.name for row in store.jobs.artifacts(lease.job_id)] == names
     assert stored_names(settings) == names
-    assert store.retention.unswept(10) == []
+    assert store.jobs.unswept(10) == []
