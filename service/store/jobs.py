@@ -159,6 +159,17 @@ def add_event(session: Session, job_id: str, kind: str, data: dict[str, Any], no
     session.execute(insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
 
 
+def put_artifact(session: Session, job_id: str, file: Published, now: float) -> list[str]:
+    """Write the row of a job's file; return the location of the file of the same name that it replaces, if any."""
+    row = session.get(ArtifactRow, (job_id, file.name))
+    replaced = [row.location] if row is not None and row.location != file.location else []
+    if row is None:
+        row = ArtifactRow(job_id=job_id, name=file.name)
+        session.add(row)
+    row.location, row.size, row.sha256, row.created_at = file.location, file.size, file.sha256, now
+    return replaced
+
+
 def holder_name(job_id: str) -> str:
     """Return the name under which a job holds its inputs."""
     return f"job:{job_id}"
@@ -573,9 +584,7 @@ class Jobs:
             if job.status != JobStatus.SUCCEEDED:
                 raise problems.NO_RESULT(job_status=job.status)
             job.viewpoints = viewpoints
-            locations = list(session.scalars(select(ArtifactRow.location).where(files)))
-            session.execute(delete(ArtifactRow).where(files))
-        return locations
+            return list(session.scalars(delete(ArtifactRow).where(files).returning(ArtifactRow.location)))
 
     def delete(self, job_id: str, owner: str | None) -> list[str]:
         """Delete an ended job and release its inputs; the caller removes its results afterwards.
@@ -634,14 +643,8 @@ class Jobs:
                 if row is None or row.location != source.location:
                     unused.append(file.location)
                     continue
-                existing = session.get(ArtifactRow, (source.job_id, file.name))
-                if existing is not None:
-                    unused.append(existing.location)
-                    session.delete(existing)
-                    session.flush()
-                values = {"name": file.name, "location": file.location, "size": file.size, "sha256": file.sha256}
                 now = self._database.clock()
-                session.add(ArtifactRow(job_id=source.job_id, created_at=now, **values))
+                unused += put_artifact(session, source.job_id, file, now)
                 add_usage(session, owner, now, bytes=file.size)
             if receipt is not None:
                 close_receipt(session, receipt)
@@ -784,10 +787,9 @@ class ShareLinks:
             NoShareError: If the job has no such share.
         """
         with self._database.writing() as session:
-            row = session.get(ShareRow, share_id, with_for_update=True)
-            if row is None or row.job_id != job_id:
+            deleted = session.execute(delete(ShareRow).where(ShareRow.id == share_id, ShareRow.job_id == job_id))
+            if not deleted.rowcount:  # type: ignore[attr-defined]
                 raise problems.NO_SHARE()
-            session.delete(row)
 
     def find(self, token: str) -> Shared:
         """Return the share with this token, and its job.

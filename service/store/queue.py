@@ -48,7 +48,7 @@ from service import problems
 from service.problems import ServiceError
 from service.states import ACTIVE, AttemptOutcome, Cause, JobStatus, Published, Transition
 from service.store.database import Database, count, observe, upsert
-from service.store.jobs import add_event, add_point, end, move, send_webhook
+from service.store.jobs import add_event, add_point, end, move, put_artifact, send_webhook
 from service.store.keys import add_usage
 from service.store.tables import (
     ArtifactRow,
@@ -490,21 +490,15 @@ def _is_held(job: JobRow, lease: Lease) -> bool:
 
 
 def _publish(session: Session, job: JobRow, files: Sequence[Published], now: float) -> list[str]:
-    unused = []
+    replaced = []
     for file in files:
         if file.step is not None:
             job.saved_step = max(job.saved_step or 0, file.step)
-        row = session.get(ArtifactRow, (job.id, file.name))
-        if row is None:
-            row = ArtifactRow(job_id=job.id, name=file.name)
-            session.add(row)
-        elif row.location != file.location:
-            unused.append(row.location)
-        row.location, row.size, row.sha256, row.created_at = file.location, file.size, file.sha256, now
+        replaced += put_artifact(session, job.id, file, now)
         if not file.name.startswith("."):
             data = {"name": file.name, "size": file.size, "sha256": file.sha256}
             add_event(session, job.id, "artifact", data, now)
-    return unused
+    return replaced
 
 
 def _causes(session: Session, job: JobRow) -> list[Cause]:
@@ -671,11 +665,10 @@ class Operations:
 
     def settle_delivery(self, delivery_id: str, wait_seconds: float | None) -> None:
         """Make a message due again after `wait_seconds`; if None, delete it because it was delivered or given up."""
+        settled = DeliveryRow.id == delivery_id
         with self._database.writing() as session:
-            row = session.get(DeliveryRow, delivery_id, with_for_update=True)
-            if row is None:
-                return
             if wait_seconds is None:
-                session.delete(row)
+                session.execute(delete(DeliveryRow).where(settled))
             else:
-                row.next_at = self._database.clock() + wait_seconds
+                again = self._database.clock() + wait_seconds
+                session.execute(update(DeliveryRow).where(settled).values(next_at=again))
