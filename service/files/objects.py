@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import fsspec
+import stamina
 from fsspec.implementations.local import LocalFileSystem
 
 from service import problems
@@ -144,12 +145,9 @@ class ObjectStore:
     def stamp(self, name: str) -> Stamp:
         """Return metadata that change when the object's content changes."""
         with self._translated(name):
-            if self.local:
-                status = Path(self._path(name)).stat()
-                return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
             self._files.invalidate_cache()
             entry = self._files.info(self._path(name))
-            return entry["size"], _changed(entry), entry.get("ETag")
+            return entry["size"], _changed(entry), entry.get("ETag"), entry.get("ino")
 
     def size(self, name: str) -> int:
         """Return the size of an object in bytes; -1 if it does not exist."""
@@ -279,16 +277,14 @@ class ObjectStore:
 
 def _uninterrupted(read: Callable[[], T]) -> T:
     """Repeat a read whose response was cut off. The S3 client has retried requests without a response."""
-    for left in reversed(range(_TRIES)):
-        started = time.monotonic()
-        try:
+    for attempt in stamina.retry_context(_may_pass, attempts=_TRIES, timeout=_ANSWER_SECONDS, wait_jitter=0):
+        with attempt:
             return read()
-        except FileNotFoundError:
-            raise
-        except Exception:
-            if not left or time.monotonic() - started > _ANSWER_SECONDS:
-                raise
     raise AssertionError
+
+
+def _may_pass(error: Exception) -> bool:
+    return not isinstance(error, FileNotFoundError)
 
 
 def _options(url: str) -> dict[str, Any]:
