@@ -116,10 +116,7 @@ class OwnerLimit:
 
     def of(self, owner: str) -> asyncio.Semaphore:
         """Return the semaphore of an owner."""
-        free = self._free.get(owner)
-        if free is None:
-            free = self._free[owner] = asyncio.Semaphore(self._most)
-        return free
+        return self._free.setdefault(owner, asyncio.Semaphore(self._most))
 
 
 class FileThreads:

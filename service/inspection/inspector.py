@@ -12,7 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,7 +42,7 @@ class Lanes:
 
     def __init__(self, count: int) -> None:
         self._free, self._own = asyncio.Semaphore(count), OwnerLimit(1)
-        self._waiting: Counter[str] = Counter()
+        self._present: Counter[str] = Counter()
 
     @asynccontextmanager
     async def turn(self, owner: str) -> AsyncIterator[None]:
@@ -51,17 +51,15 @@ class Lanes:
         Raises:
             BUSY: If too many requests of this owner wait already.
         """
-        if self._waiting[owner] >= MAX_WAITING:
+        if self._present[owner] > MAX_WAITING:  # one of them has its turn
             raise problems.BUSY("Too many files of this key are being checked. Try again later.")
-        async with AsyncExitStack() as stack:
-            self._waiting[owner] += 1
-            try:
-                # in this order, one request of each owner waits for its turn, behind those of the other owners
-                await stack.enter_async_context(self._own.of(owner))
-                await stack.enter_async_context(self._free)
-            finally:
-                self._waiting -= Counter([owner])
-            yield
+        self._present[owner] += 1
+        try:
+            # in this order, one request of each owner waits for its turn, behind those of the other owners
+            async with self._own.of(owner), self._free:
+                yield
+        finally:
+            self._present -= Counter([owner])
 
 
 #: Task of the inspecting process: validate a job's inputs, or plan the job as well.
