@@ -208,12 +208,9 @@ class Publisher:
         self.publish(put_patiently(self._outbox, given_up))
         self._store.leases.succeed(self._lease, list(self._results.values()), result)
 
-    def log_tail(self) -> str | None:
-        """Return the end of the log; None if there is no log."""
-        try:
-            return (self._folder / "log.txt").read_bytes()[-_LOG_TAIL:].decode(errors="replace")
-        except OSError:
-            return None
+    def log_tail(self) -> str:
+        """Return the end of the log."""
+        return (self._folder / "log.txt").read_bytes()[-_LOG_TAIL:].decode(errors="replace")
 
 
 def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Published]:

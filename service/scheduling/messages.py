@@ -203,7 +203,7 @@ def attempt_ending(
     request: StopRequest | None,
     reported: Ending | None,
     exit_code: int,
-    log_tail: str | None,
+    log_tail: str,
     *,
     has_result: bool,
     cluster: bool = False,
@@ -214,7 +214,7 @@ def attempt_ending(
         request: CANCEL or RELEASE if the end was requested, possibly too late; None otherwise.
         reported: Ending that the process has reported; None if it was interrupted or died.
         exit_code: Exit code of the process; negative for the signal that killed it.
-        log_tail: Last part of the process' log; None if there is no log.
+        log_tail: Last part of the process' log.
         has_result: Whether the stylized scene exists.
         cluster: Whether the process only supervises ranks on a Ray cluster. Ray terminates it with an exit code and
             without a report if the cluster's head or the machine's own node dies; that counts as an outage.
@@ -239,7 +239,7 @@ def attempt_ending(
     return Ending(AttemptOutcome.FAILED, error=crash)
 
 
-def _crash_error(exit_code: int, log_tail: str | None) -> dict[str, Any]:
+def _crash_error(exit_code: int, log_tail: str) -> dict[str, Any]:
     """Return the error of a process that ended without a report."""
     if exit_code == -signal.SIGKILL:
         message = "The process that ran the job was killed; the machine may have run out of memory."
@@ -247,5 +247,4 @@ def _crash_error(exit_code: int, log_tail: str | None) -> dict[str, Any]:
         message = f"The process that ran the job was ended by {signal.Signals(-exit_code).name}."
     else:
         message = f"The process that ran the job ended with code {exit_code}."
-    error = {"code": "crashed", "message": message}
-    return error if log_tail is None else {**error, "log": log_tail}
+    return {"code": "crashed", "message": message, "log": log_tail}

@@ -414,10 +414,9 @@ class Jobs:
             used_key = None
             if idempotency is not None:
                 used_key = idempotency_row(session, new.owner, idempotency.key, idempotency.fingerprint, now)
-            if used_key is not None and used_key.created_id:
-                known = session.get(JobRow, used_key.created_id)
-                if known is not None:
-                    return known, False
+            known = session.get(JobRow, used_key.created_id) if used_key and used_key.created_id else None
+            if known is not None:
+                return known, False
             _check_queue(session, new.owner, limit)
             count_job(session, new.owner, quotas, now, sum(entry["size"] for entry in new.inputs))
             values = new.row(now)

@@ -44,7 +44,7 @@ REQUESTS = [None, StopRequest.CANCEL, StopRequest.RELEASE]
 
 
 def ending(
-    requested: StopRequest | None, last: Ending | None, code: int = 0, log: str | None = "the log", **has: bool
+    requested: StopRequest | None, last: Ending | None, code: int = 0, log: str = "the log", **has: bool
 ) -> Ending:
     return attempt_ending(requested, last, code, log, **{"has_result": True, **has})
 
@@ -102,7 +102,6 @@ def test_process_without_a_reported_ending_has_crashed(code: int, text: str) -> 
     error: dict[str, Any] = outcome.error or {}
     assert (error["code"], error["log"]) == ("crashed", "the log")
     assert text in error["message"]
-    assert "log" not in (ending(None, None, code, None).error or {})
 
 
 @pytest.mark.parametrize(
@@ -270,8 +269,6 @@ def test_log_is_copied_periodically_and_completely_at_the_end(
     publisher.publish_unfinished(whole_log=True)
     assert content(store, settings, lease, "log.txt") == b"first\nsecond\n"
     assert publisher.log_tail() == "first\nsecond\n"
-    (folder / "log.txt").unlink()
-    assert publisher.log_tail() is None
 
 
 def test_published_checkpoint_records_its_step(publisher: Publisher, folder: Path, store: Store, lease: Lease) -> None:
