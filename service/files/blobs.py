@@ -126,13 +126,9 @@ class Blobs(ABC):
         self.incoming.mkdir(parents=True, exist_ok=True)
         self._inputs, self._min_free = inputs, min_free
 
-    def missing_space(self, size: int) -> int:
-        """Return the bytes to free before `size` bytes (at least one) can be written; not positive if they can."""
-        return max(size, 1) + self._min_free - shutil.disk_usage(self.incoming).free
-
     def ensure_space(self, size: int) -> None:
-        """Raise NoSpaceError if `size` more bytes would leave too little free disk space."""
-        if self.missing_space(size) > 0:
+        """Raise NoSpaceError if `size` more bytes, at least one, would leave too little free disk space."""
+        if shutil.disk_usage(self.incoming).free < max(size, 1) + self._min_free:
             raise problems.NO_SPACE()
         inodes = os.statvfs(self.incoming)
         if inodes.f_files and inodes.f_favail < _MIN_FREE_INODES:  # file systems without an inode table report 0

@@ -109,14 +109,13 @@ def end(session: Session, job: JobRow, transition: Transition, now: float, reten
     Args:
         retention: Most seconds until its results expire; see `retention_of`.
     """
-    status = next_status(job.status, transition)
     job.finished_at, job.expires_at = now, now + retention_of(job, retention)
     job.lease_owner = job.lease_expires_at = None
     move(session, job, transition, now)
-    count(session, "sgsst_jobs_finished_total", f'status="{status}"')
+    count(session, "sgsst_jobs_finished_total", f'status="{job.status}"')
     for waiting in session.scalars(_WAITING_PROGRESS, {"job_id": job.id}) if job.webhook_events else ():
         session.delete(waiting)
-    send_webhook(session, job, "completed", status, now)
+    send_webhook(session, job, "completed", job.status, now)
 
 
 def retention_of(job: JobRow, most: float) -> float:
@@ -252,19 +251,12 @@ def _counts_and_named(
     """Return the number of files by role of each job, and its entries of scene, style images and camera files."""
     counts: dict[str, dict[str, int]] = {job_id: {} for job_id in job_ids}
     named: dict[str, list[dict[str, Any]]] = {job_id: [] for job_id in job_ids}
-    if job_ids:
-        of_jobs = {"ids": list(job_ids)}
-        for job_id, role, number in connection.execute(_input_query(connection, "counts"), of_jobs):
-            counts[job_id][role] = number
-        for job_id, entry in connection.execute(
-            _input_query(connection, "named"), {**of_jobs, "roles": list(_NAMED_ROLES)}
-        ):
-            named[job_id].append(json.loads(entry))
+    of_jobs, queries = {"ids": list(job_ids)}, _queries(connection.dialect.name)
+    for job_id, role, number in connection.execute(queries["counts"], of_jobs):
+        counts[job_id][role] = number
+    for job_id, entry in connection.execute(queries["named"], {**of_jobs, "roles": list(_NAMED_ROLES)}):
+        named[job_id].append(json.loads(entry))
     return counts, named
-
-
-def _input_query(connection: Connection, name: str) -> TextClause:
-    return _queries(connection.dialect.name)[name]
 
 
 @cache
@@ -454,14 +446,14 @@ class Jobs:
         """Return a job's inputs from a position on, each with its index among those of its role."""
         with self._database.reading_rows() as connection:
             parameters = {"ids": [job_id], "start": start, "most": limit}
-            rows = connection.execute(_input_query(connection, "page"), parameters)
+            rows = connection.execute(_queries(connection.dialect.name)["page"], parameters)
             return [(index, json.loads(entry)) for index, entry in rows]
 
     def input(self, job_id: str, role: str, index: int) -> dict[str, Any] | None:
         """Return an input of a job by its role and its index among those of the role; None if there is none."""
         with self._database.reading_rows() as connection:
             parameters = {"ids": [job_id], "roles": [role], "index": index}
-            entry = connection.execute(_input_query(connection, "one"), parameters).scalar()
+            entry = connection.execute(_queries(connection.dialect.name)["one"], parameters).scalar()
             return None if entry is None else dict(json.loads(entry))
 
     def detail(self, job_id: str, owner: str | None) -> tuple[ShownJob, list[AttemptRow]]:
