@@ -251,11 +251,12 @@ def _counts_and_named(
     """Return the number of files by role of each job, and its entries of scene, style images and camera files."""
     counts: dict[str, dict[str, int]] = {job_id: {} for job_id in job_ids}
     named: dict[str, list[dict[str, Any]]] = {job_id: [] for job_id in job_ids}
-    of_jobs, queries = {"ids": list(job_ids)}, _queries(connection.dialect.name)
-    for job_id, role, number in connection.execute(queries["counts"], of_jobs):
-        counts[job_id][role] = number
-    for job_id, entry in connection.execute(queries["named"], {**of_jobs, "roles": list(_NAMED_ROLES)}):
-        named[job_id].append(json.loads(entry))
+    if job_ids:  # PostgreSQL compares with no type in an empty list
+        of_jobs, queries = {"ids": list(job_ids)}, _queries(connection.dialect.name)
+        for job_id, role, number in connection.execute(queries["counts"], of_jobs):
+            counts[job_id][role] = number
+        for job_id, entry in connection.execute(queries["named"], {**of_jobs, "roles": list(_NAMED_ROLES)}):
+            named[job_id].append(json.loads(entry))
     return counts, named
 
 
