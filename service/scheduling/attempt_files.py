@@ -258,7 +258,11 @@ class RankFolder:
     """
 
     def __init__(self, workplace: StoreWorkplace, rank: int, stored: Stored) -> None:
-        settings = node_settings()
+        if not os.environ.get("SGSST_DATA"):
+            raise InfrastructureError(
+                f"{socket.gethostname()} has no SGSST_DATA. Set it to a folder before `ray start`."
+            )
+        settings = read_settings()
         keep_private(settings)
         parent = settings.folder / "ranks"
         parent.mkdir(parents=True, exist_ok=True)
@@ -389,29 +393,12 @@ def _digest(path: Path, _size: int, _changed: int) -> str:
     return file_digest(path)
 
 
-def node_settings() -> ServiceSettings:
-    """Return the settings of this machine.
-
-    Raises:
-        InfrastructureError: If its environment names no data folder.
-    """
-    if not os.environ.get("SGSST_DATA"):
-        raise InfrastructureError(f"{socket.gethostname()} has no SGSST_DATA. Set it to a folder before `ray start`.")
-    return read_settings()
-
-
 def remove_leftovers() -> None:
     """Remove the folders of dead ranks on this machine: those whose lock is not held."""
-    try:
-        parent = node_settings().folder / "ranks"
-    except InfrastructureError:  # ranks refuse it, too
-        return
-    if not parent.is_dir():
-        return
-    with locked(parent / "all"):
-        for path in parent.iterdir():
-            if not path.is_dir():
-                continue
-            with contextlib.suppress(OSError), (path / "lock").open("a") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(path, ignore_errors=True)
+    parent = read_settings().folder / "ranks"
+    if parent.is_dir():
+        with locked(parent / "all"):
+            for path in filter(Path.is_dir, parent.iterdir()):
+                with contextlib.suppress(OSError), (path / "lock").open("a") as lock:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(path, ignore_errors=True)
