@@ -620,7 +620,7 @@ class Operations:
     ) -> list[tuple[DeliveryRow, str]]:
         """Claim due messages for sending; no other dispatcher gets them for `hold_seconds`.
 
-        Each message comes with the owner of its job, who is empty if the job is deleted, and counts this attempt.
+        Each message counts this attempt, and comes with the owner of its job: an empty text if the job is deleted.
 
         Args:
             sending: Messages that this dispatcher is already sending; they count toward the limits.
