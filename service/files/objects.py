@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import fsspec
-import stamina
 from fsspec.implementations.local import LocalFileSystem
 
 from service import problems
@@ -277,14 +276,16 @@ class ObjectStore:
 
 def _uninterrupted(read: Callable[[], T]) -> T:
     """Repeat a read whose response was cut off. The S3 client has retried requests without a response."""
-    for attempt in stamina.retry_context(_may_pass, attempts=_TRIES, timeout=_ANSWER_SECONDS, wait_jitter=0):
-        with attempt:
+    for left in reversed(range(_TRIES)):
+        started = time.monotonic()
+        try:
             return read()
+        except FileNotFoundError:
+            raise
+        except Exception:
+            if not left or time.monotonic() - started > _ANSWER_SECONDS:
+                raise
     raise AssertionError
-
-
-def _may_pass(error: Exception) -> bool:
-    return not isinstance(error, FileNotFoundError)
 
 
 def _options(url: str) -> dict[str, Any]:
