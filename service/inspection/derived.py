@@ -318,27 +318,18 @@ class DerivedFiles:
         return await self._threads.run(job.owner, staging, size=size)
 
     def _publish(self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas) -> None:
-        """Charge the owner of a job for files derived from its result, store them, and make them visible.
-
-        The charge is a receipt until the files have rows. It ends if they cannot be stored, and expires if this process
-        dies.
+        """Store files derived from a job's result, and make them visible.
 
         Raises:
-            QUOTA_EXCEEDED: If they exceed the owner's quota of stored bytes; nothing is stored.
+            QUOTA_EXCEEDED: If they exceed the owner's quota of stored bytes; nothing remains stored.
         """
-        store, artifacts = self._store, self._artifacts
-        known = {row.name: row.size for row in store.jobs.artifacts(job.id)}
-        size = sum(path.stat().st_size - known.get(name, 0) for name, path in files.items())
-        receipt = store.inputs.open_receipt(job.owner, max(0, size), quotas)
         put: list[Published] = []
         unused: list[str] | None = None
         try:
             for name, path in files.items():
                 # later than the epoch of the last lease, so that the file is not swept as a leftover of an attempt
-                put.append(artifacts.put(job.id, job.lease_epoch + 1, name, path, final=True))
-            unused = store.jobs.add_derived(result, put, job.owner, quotas, receipt=receipt)
+                put.append(self._artifacts.put(job.id, job.lease_epoch + 1, name, path, final=True))
+            unused = self._store.jobs.add_derived(result, put, job.owner, quotas)
         finally:
-            if unused is None:
-                store.inputs.end_receipt(receipt)
             for location in [file.location for file in put] if unused is None else unused:
-                artifacts.objects.remove(location)
+                self._artifacts.objects.remove(location)

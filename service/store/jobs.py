@@ -611,14 +611,11 @@ class Jobs:
         files: Sequence[Published],
         owner: str,
         quotas: Quotas = NO_QUOTAS,
-        *,
-        receipt: str | None = None,
     ) -> list[str]:
         """Publish files derived from `source`, replacing those of the same names, unless `source` is gone.
 
         Args:
             source: Row of the file that they were derived from.
-            receipt: Receipt that the owner was charged by before the files were stored; the files take it over.
 
         Returns:
             Locations of files without a row: replaced ones, and those whose `source` is gone or replaced.
@@ -638,8 +635,6 @@ class Jobs:
                 now = self._database.clock()
                 unused += put_artifact(session, source.job_id, file, now)
                 add_usage(session, owner, now, bytes=file.size)
-            if receipt is not None:
-                close_receipt(session, receipt)
             session.flush()
             check_bytes(session, owner, quotas)
         return unused
