@@ -363,7 +363,6 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
     for path, sha256 in files:
         link = folder / path
         link.parent.mkdir(parents=True, exist_ok=True)
-        link.unlink(missing_ok=True)
         link.symlink_to(blobs[sha256])
     return staged
 

@@ -483,11 +483,6 @@ class StoredBlobs(Blobs):
         """Remove the upload's objects."""
         self.objects.remove_below(f"{UPLOADS}/{upload_id}")
 
-    def collect(self) -> None:
-        """Remove expired uploads and unused blobs, and evict cached files that were in use."""
-        super().collect()
-        self._cache.evict()
-
 
 class _ObjectWriter(PartWriter):
     """Writer of an upload's bytes: a file on this host buffers them until they are saved to the store."""

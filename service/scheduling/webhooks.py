@@ -104,10 +104,8 @@ class Deliverer:
             _log.warning(
                 "webhook failed, %s: try=%d error=%s", outcome, delivery.tries, error, extra={"job": delivery.job_id}
             )
-        try:
-            await asyncio.to_thread(self._store.operations.settle_delivery, delivery.id, wait)
-        except Exception:  # due again when the hold expires
-            _log.exception("webhook outcome not stored", extra={"job": delivery.job_id})
+        # if this fails, asyncio logs the error, and the message is due again when the hold expires
+        await asyncio.to_thread(self._store.operations.settle_delivery, delivery.id, wait)
 
     async def _send(self, delivery: DeliveryRow) -> str | None:
         """Send one message and return the error; None for success."""
