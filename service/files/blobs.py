@@ -1,9 +1,7 @@
 """Inputs of jobs: files that are received in constant memory and deduplicated by SHA-256.
 
 If the file store is a local folder, inputs are files in the data folder (`BlobFolder`). Otherwise they are objects of
-the file store (`service.files.blobs`). Both implement `Blobs`.
-
-Inputs in a remote file store that all hosts share; reads go through a cache on this host.
+the file store, which all hosts share, and are read through a cache on this host (`StoredBlobs`).
 """
 
 from __future__ import annotations

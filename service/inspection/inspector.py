@@ -118,13 +118,25 @@ class InspectionProcess:
         """Return the response to a request.
 
         Raises:
-            BUSY: If the process died twice.
+            BUSY: If the process died.
         """
         line = request.model_copy(update={"threads": self.threads}).model_dump_json().encode() + b"\n"
-        for _ in range(2):
-            answer = await self._exchange(line, show)
-            if answer is not None:
-                return answer
+        process, answered = await self.start(), False
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            with suppress(OSError, ValueError):
+                process.stdin.write(line)
+                await process.stdin.drain()
+                while response := await process.stdout.readline():
+                    answer: dict[str, Any] = json.loads(response)
+                    if "planning" not in answer:
+                        answered = True
+                        return answer
+                    show(answer["planning"])
+        finally:
+            if not answered:  # a later response must not be read as that of another request
+                await self.close()
         raise problems.BUSY("Files cannot be checked at the moment. Try again later.")
 
     async def start(self) -> asyncio.subprocess.Process:
@@ -140,29 +152,6 @@ class InspectionProcess:
                     start_new_session=True,
                 )
             return self._process
-
-    async def _exchange(self, line: bytes, show: Show) -> dict[str, Any] | None:
-        process = await self.start()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        try:
-            process.stdin.write(line)
-            await process.stdin.drain()
-            while response := await process.stdout.readline():
-                answer: dict[str, Any] = json.loads(response)
-                if "planning" not in answer:
-                    return answer
-                show(answer["planning"])
-            return None
-        except (OSError, ValueError):
-            await self.close()  # further output must not be read as the response to a later request
-            return None
-        except asyncio.CancelledError:  # else the pending response would be read as that of the next request
-            await self.close()
-            raise
-        finally:
-            if process.returncode is None and process.stdout.at_eof():
-                await self.close()
 
     def _environment(self) -> dict[str, str]:
         """Return the environment variables of the process.
