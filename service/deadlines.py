@@ -146,11 +146,7 @@ class FileThreads:
         try:
             async with asyncio.timeout(self._seconds + size / LEAST_RATE) as limit:
                 await free.acquire()
-                try:
-                    future = self._pool.submit(copy_context().run, function, *arguments)
-                except BaseException:
-                    free.release()
-                    raise
+                future = self._pool.submit(copy_context().run, function, *arguments)
                 future.add_done_callback(partial(_release, asyncio.get_running_loop(), free))
                 return await asyncio.wrap_future(future)
         except TimeoutError as error:

@@ -269,7 +269,7 @@ class ObjectStore:
             if self.local or (isinstance(error, FileNotFoundError) and (not self._s3 or self._exists())):
                 raise
             error.add_note(f"store of files: {name}")  # for the operator's log
-            if isinstance(error, OSError) and error.errno in DISK_FULL:
+            if is_full(error):
                 raise problems.NO_SPACE() from error
             raise problems.STORE_UNAVAILABLE() from error
 
@@ -440,13 +440,9 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-def is_full(error: BaseException | None) -> bool:
-    """Return whether an error, or one of its causes, reports a full disk."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in DISK_FULL:
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+def is_full(error: BaseException) -> bool:
+    """Return whether an error, or its cause, reports a full disk."""
+    return any(isinstance(each, OSError) and each.errno in DISK_FULL for each in (error, error.__cause__))
 
 
 #: Error numbers that mean that a hard link is impossible: different file systems, or no support for hard links.

@@ -67,20 +67,17 @@ class Gate:
         patience = self._seconds if refusal is None else _PROBE_SECONDS
         if patience is not None and not self._turn.acquire(timeout=patience):
             raise problems.DATABASE_BUSY() if refusal is None else refusal.problem()
+        failure = None
         try:
             with translated():
                 yield
         except DatabaseUnavailableError as error:
             if refusal is None:
                 _log.warning("database unavailable: %s", getattr(error.__cause__, "orig", error))  # without the SQL
-            self._refusal = error
+            failure = error
             raise
-        except BaseException:
-            self._refusal = None
-            raise
-        else:
-            self._refusal = None
         finally:
+            self._refusal = failure
             if patience is not None:
                 self._turn.release()
 
