@@ -15,7 +15,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
-from types import FrameType
 
 from service.files.blobs import open_blobs
 from service.files.objects import Artifacts
@@ -144,9 +143,7 @@ class Dispatcher:
                     shutil.rmtree(path, ignore_errors=True)
 
     def _work_once(self) -> None:
-        for job_id, attempt in list(self._running.items()):
-            if not attempt.alive:
-                del self._running[job_id]
+        self._running = {job_id: attempt for job_id, attempt in self._running.items() if attempt.alive}
         self._update_leases()
         if time.monotonic() - self._announced_at >= RENEW_FRACTION * self._settings.lease_seconds:
             free = self._capacity.free([attempt.grant for attempt in self._running.values()])
@@ -218,11 +215,8 @@ def main() -> None:
     settings = start()
     dispatcher = Dispatcher(settings, open_store(settings, patience=settings.start_seconds))
 
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        dispatcher.stop()
-
     for number in STOP_SIGNALS:
-        signal.signal(number, handle)
+        signal.signal(number, lambda number, frame: dispatcher.stop())
     dispatcher.run()
     logging.shutdown()
     os._exit(0)  # threads that wait for a hanging file store would be waited for
