@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -379,18 +379,12 @@ def store_weights(objects: ObjectStore) -> tuple[Published, ...]:
     """
     weights = []
     for path in sorted(cache_folder().glob("*.safetensors")):
-        status = path.stat()
-        sha256 = _digest(path, status.st_size, status.st_mtime_ns)
+        sha256 = file_digest(path)
         location = f"{_WEIGHTS_FOLDER}/{sha256}"
         if objects.size(location) < 0:
             objects.put(path, location)
-        weights.append(Published(path.name, location, status.st_size, sha256))
+        weights.append(Published(path.name, location, path.stat().st_size, sha256))
     return tuple(weights)
-
-
-@lru_cache
-def _digest(path: Path, _size: int, _changed: int) -> str:
-    return file_digest(path)
 
 
 def remove_leftovers() -> None:
