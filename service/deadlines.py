@@ -116,10 +116,7 @@ class OwnerLimit:
 
     def of(self, owner: str) -> asyncio.Semaphore:
         """Return the semaphore of an owner."""
-        free = self._free.get(owner)
-        if free is None:
-            free = self._free[owner] = asyncio.Semaphore(self._most)
-        return free
+        return self._free.setdefault(owner, asyncio.Semaphore(self._most))
 
 
 class FileThreads:
@@ -149,11 +146,7 @@ class FileThreads:
         try:
             async with asyncio.timeout(self._seconds + size / LEAST_RATE) as limit:
                 await free.acquire()
-                try:
-                    future = self._pool.submit(copy_context().run, function, *arguments)
-                except BaseException:
-                    free.release()
-                    raise
+                future = self._pool.submit(copy_context().run, function, *arguments)
                 future.add_done_callback(partial(_release, asyncio.get_running_loop(), free))
                 return await asyncio.wrap_future(future)
         except TimeoutError as error:

@@ -267,11 +267,7 @@ def check_roles(
         message = "'photos' requires 'cameras', and cannot be combined with an orbit. Send the cameras of the photos."
         raise unfit(message, input="photos")
     _check_camera_files([entry["name"] for entry in by_role["cameras"]])
-    (((role, name), count),) = Counter((entry["role"], entry["name"].lower()) for entry in inputs).most_common(1)
-    if count > 1:
-        raise problems.INVALID_REQUEST(f"Two files of {role!r} have the name {name!r}. Rename one.")
-    for role in _FOLDER_ROLES:
-        _check_folders(role, by_role[role])
+    _check_names(inputs)
 
 
 def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int:
@@ -316,15 +312,16 @@ def _check_region_masks(names: Sequence[str], regions: Sequence[RegionRequest]) 
         )
 
 
-def _check_folders(role: str, inputs: Sequence[Mapping[str, Any]]) -> None:
-    """Reject the inputs of a role if the name of one is also the folder of another."""
-    names = {entry["name"] for entry in inputs}
-    for name in names:
-        parent = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in names), None)
-        if parent:
-            raise problems.INVALID_REQUEST(
-                f"The file {parent!r} of {role!r} is also the folder of {name!r}. Rename one."
-            )
+def _check_names(inputs: Sequence[Mapping[str, Any]]) -> None:
+    """Reject inputs of a role with the same name, except for case, or if the name of one is the folder of another."""
+    paths = [PurePosixPath(entry["role"], entry["name"].lower()) for entry in inputs]
+    taken = Counter(paths)
+    for path, entry in zip(paths, inputs, strict=True):
+        role, name = entry["role"], entry["name"]
+        if taken[path] > 1:
+            raise problems.INVALID_REQUEST(f"Two files of {role!r} have the name {name!r}. Rename one.")
+        if any(folder in taken for folder in path.parents):
+            raise problems.INVALID_REQUEST(f"A file of {role!r} is also the folder of {name!r}. Rename one.")
 
 
 def _check_camera_files(names: Sequence[str]) -> None:
@@ -366,7 +363,6 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
     for path, sha256 in files:
         link = folder / path
         link.parent.mkdir(parents=True, exist_ok=True)
-        link.unlink(missing_ok=True)
         link.symlink_to(blobs[sha256])
     return staged
 

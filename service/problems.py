@@ -69,11 +69,7 @@ class DamagedFileError(ServiceError):
 
 
 class DatabaseUnavailableError(ServiceError, InfrastructureError):
-    """Database that does not respond."""
-
-
-class DatabaseBusyError(DatabaseUnavailableError):
-    """Database that stays locked for too long, or whose connections are all in use."""
+    """Database that does not respond, stays locked for too long, or has no free connection."""
 
 
 class LeaseLostError(ServiceError):
@@ -491,7 +487,11 @@ DATABASE_UNAVAILABLE = ProblemType(
     error=DatabaseUnavailableError,
 )
 DATABASE_BUSY = ProblemType(
-    "database-busy", 503, "The service's database is busy. Try again later.", retry_after=5, error=DatabaseBusyError
+    "database-busy",
+    503,
+    "The service's database is busy. Try again later.",
+    retry_after=5,
+    error=DatabaseUnavailableError,
 )
 LEASE_LOST = ProblemType(
     "lease-lost",

@@ -69,7 +69,7 @@ class ServiceSettings(BaseSettings):
     max_views: int = Field(2_000, gt=0)
     max_pixels: int = Field(20_000_000_000, gt=0)
     max_image_pixels: int = Field(100_000_000, gt=0)
-    max_photos: int = Field(2_000, gt=0)
+    max_photos: int = Field(2_000, gt=0, le=30_000)  # SQLite's statements have at most 32,766 values
     max_jobs_per_key: int = Field(100, gt=0)
     max_jobs_a_day_per_key: int | None = Field(None, ge=0)
     max_gpu_seconds_a_day_per_key: float | None = Field(None, ge=0)
@@ -187,16 +187,6 @@ class ServiceSettings(BaseSettings):
         return self.artifacts or f"file://{self.folder / 'artifacts'}"
 
     @property
-    def session_seconds(self) -> float:
-        """Duration of `session_days` in seconds."""
-        return self.session_days * 86_400.0
-
-    @property
-    def retention_seconds(self) -> float:
-        """Duration of `retention_days` in seconds."""
-        return self.retention_days * 86_400.0
-
-    @property
     def frame_ancestors(self) -> str:
         """Sources of Content-Security-Policy that may show shared results in a frame."""
         origins = sorted(parse_origins(self.embed_origins))
@@ -265,8 +255,6 @@ def _log_once(damage: str) -> None:
     _log.error("weights damaged, no job is accepted or started: %s", damage)
 
 
-#: Suffixes of the files that SQLite creates for a database.
-_BESIDE = ("", "-wal", "-shm")
 _FIELDS = ("job", "attempt", "method", "path", "status", "seconds", "request_id", "owner")
 
 
@@ -337,23 +325,20 @@ def start() -> ServiceSettings:
 
 
 def keep_private(settings: ServiceSettings) -> None:
-    """Create the data folder, restrict it and the database to the owner, and set a umask for everything written later.
+    """Create the data folder, restrict it and that of results to the owner, and set a umask for all that is written.
 
-    Paths that belong to another user and cannot be restricted are logged.
+    Folders that belong to another user and cannot be restricted are logged.
     """
     from fsspec.core import split_protocol
-    from sqlalchemy.engine import make_url
 
     os.umask(0o077)
     settings.folder.mkdir(parents=True, exist_ok=True)
-    (protocol, artifacts), url = split_protocol(settings.artifacts_url), make_url(settings.database_url)
+    protocol, artifacts = split_protocol(settings.artifacts_url)
     paths = [settings.folder, *([Path(artifacts)] if protocol in (None, "file", "local") else [])]
-    if url.get_backend_name() == "sqlite" and url.database:
-        paths += [Path(url.database + ending) for ending in _BESIDE]
     for path in filter(Path.exists, paths):
         mode = stat.S_IMODE(path.stat().st_mode)
         if mode & 0o077:
             try:
                 path.chmod(mode & 0o700)
             except PermissionError:
-                _log.warning("file readable by other users, and owned by another user: path=%s", path)
+                _log.warning("folder readable by other users, and owned by another user: path=%s", path)

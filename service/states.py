@@ -54,7 +54,7 @@ class Cause(StrEnum):
 class Transition(StrEnum):
     """Transition of a job from one state to another."""
 
-    #: A dispatcher leases the job, for the first time or after its previous lease was lost.
+    #: A dispatcher leases the job.
     TAKE = "take"
     #: The inputs have been read and the first step starts.
     START = "start"
@@ -110,7 +110,7 @@ TITLES: Mapping[JobStatus, str] = {
 #: Target state per transition and initial state; other combinations are not allowed. A job that is being canceled is
 #: stopped however its attempt ends, unless the attempt succeeds first.
 TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
-    Transition.TAKE: dict.fromkeys((_S.QUEUED, *WORKING), _S.STARTING),
+    Transition.TAKE: {_S.QUEUED: _S.STARTING},
     Transition.START: {_S.STARTING: _S.RUNNING, _S.RUNNING: _S.RUNNING, _S.CANCELING: _S.CANCELING},
     Transition.SUCCEED: dict.fromkeys(ACTIVE, _S.SUCCEEDED),
     Transition.FAIL: dict.fromkeys(WORKING, _S.FAILED),

@@ -629,11 +629,9 @@ async def create_job(
         if findings is None:
             for entry in inputs:
                 check_size(entry["role"], entry["name"], entry["size"])
-            # a dry run's files are checked and planned in one reading, if that can start now
-            if not dry_run or context.inspector.processes.is_busy("plan"):
-                findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
+            findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
-            up, foreign = (findings["up"], findings["foreign"]) if sure_up and findings else (None, None)
+            up, foreign = (findings["up"], findings["foreign"]) if sure_up else (None, None)
             if foreign:
                 raise problems.UNSURE_CAMERAS(reason=foreign, input="cameras")
             if up and not up["sure"]:
@@ -645,11 +643,11 @@ async def create_job(
         stack.pop_all()  # keep the files, which planning needs after this function returns
 
     checked = asyncio.Event()
+    checked.set()
 
     async def plan(show: Show) -> PlanView:
         async with receipt:
-            inspect = context.inspector.inspect
-            findings = await inspect("plan", caller.owner, inputs, rows, parameters, show, checked.set)
+            findings = await context.inspector.inspect("plan", caller.owner, inputs, rows, parameters, show)
         return PlanView(**findings, workers=parameters.workers)
 
     return await answer_work(request, plan, "planning", "plan", context.hub.working, checked)

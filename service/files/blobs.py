@@ -1,9 +1,7 @@
 """Inputs of jobs: files that are received in constant memory and deduplicated by SHA-256.
 
 If the file store is a local folder, inputs are files in the data folder (`BlobFolder`). Otherwise they are objects of
-the file store (`service.files.blobs`). Both implement `Blobs`.
-
-Inputs in a remote file store that all hosts share; reads go through a cache on this host.
+the file store, which all hosts share, and are read through a cache on this host (`StoredBlobs`).
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ import secrets
 import shutil
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from io import FileIO
 from pathlib import Path
@@ -28,7 +26,7 @@ from service.files.objects import Artifacts, FileCache, ObjectStore, disk_errors
 from service.problems import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
 from service.settings import ServiceSettings
 from service.store.files import BLOBS, UPLOADS, InputRows, check_offset
-from service.store.tables import BlobRow, UploadPartRow, UploadRow
+from service.store.tables import BlobRow, UploadRow
 from sgsst_core.files.atomic import file_digest, flush_folder
 
 _log = logging.getLogger(__name__)
@@ -126,13 +124,9 @@ class Blobs(ABC):
         self.incoming.mkdir(parents=True, exist_ok=True)
         self._inputs, self._min_free = inputs, min_free
 
-    def missing_space(self, size: int) -> int:
-        """Return the bytes to free before `size` bytes (at least one) can be written; not positive if they can."""
-        return max(size, 1) + self._min_free - shutil.disk_usage(self.incoming).free
-
     def ensure_space(self, size: int) -> None:
-        """Raise NoSpaceError if `size` more bytes would leave too little free disk space."""
-        if self.missing_space(size) > 0:
+        """Raise NoSpaceError if `size` more bytes, at least one, would leave too little free disk space."""
+        if shutil.disk_usage(self.incoming).free < max(size, 1) + self._min_free:
             raise problems.NO_SPACE()
         inodes = os.statvfs(self.incoming)
         if inodes.f_files and inodes.f_favail < _MIN_FREE_INODES:  # file systems without an inode table report 0
@@ -276,7 +270,6 @@ class BlobFolder(Blobs):
         else:
             known.parent.mkdir(exist_ok=True)
             final.replace(known)
-            final.unlink(missing_ok=True)  # renaming one of two hard links to the other is a no-op
             flush_folder(known.parent)
         return sha256
 
@@ -429,7 +422,7 @@ class StoredBlobs(Blobs):
         try:
             super().ensure_space(size)
         except NoSpaceError:
-            self._cache.free(self.missing_space(size))
+            self._cache.evict(max(size, 1) + self._min_free)
             super().ensure_space(size)
 
     def add(self, path: Path, upload_id: str | None = None) -> str:
@@ -440,7 +433,14 @@ class StoredBlobs(Blobs):
         sha256, size = file_digest(path), path.stat().st_size
         location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
         self.objects.put(path, f"{BLOBS}/{location}")
-        self._take_in(sha256, location, size, upload_id, path)
+        known = self._register(sha256, location, size, upload_id)
+        if known != location:
+            self.remove([location])
+        try:
+            self.objects.check(f"{BLOBS}/{known}", sha256)
+        except (LostFileError, DamagedFileError):
+            self.objects.put(path, f"{BLOBS}/{known}")
+        self._cache.adopt(path, sha256)
         return sha256
 
     def fetch(self, rows: Mapping[str, BlobRow], folder: Path) -> dict[str, Path]:
@@ -453,20 +453,6 @@ class StoredBlobs(Blobs):
             self._cache.link(sha256, row.size, paths[sha256], partial(self.objects.get, f"{BLOBS}/{row.location}"))
         return paths
 
-    def _take_in(self, sha256: str, location: str, size: int, upload_id: str | None, path: Path) -> None:
-        """Register an object as a blob, and move its file into the cache.
-
-        If its content is known, the object is removed, and the file replaces the known blob if that is lost or damaged.
-        """
-        known = self._register(sha256, location, size, upload_id)
-        if known != location:
-            self.remove([location])
-        try:
-            self.objects.check(f"{BLOBS}/{known}", sha256)
-        except (LostFileError, DamagedFileError):
-            self.objects.put(path, f"{BLOBS}/{known}")
-        self._cache.adopt(path, sha256)
-
     # --- uploads ---------------------------------------------------------------------------------------------------
 
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
@@ -474,73 +460,26 @@ class StoredBlobs(Blobs):
         return _ObjectWriter(self.incoming, self.objects, self._inputs, upload, seconds)
 
     def _finish_upload(self, upload: UploadRow, seconds: float) -> str:
+        parts = self._inputs.parts(upload.id)
+        if sum(part.size for part in parts) != upload.length:
+            raise FileNotFoundError(upload.id)
+        self.ensure_space(upload.length)
         whole = self.incoming / f"{secrets.token_hex(12)}.part"
         try:
-            sha256 = self._finish(upload, whole)
+            with whole.open("wb", buffering=0) as file:
+                for part in parts:
+                    for data in self.objects.read(part.location, 0, part.size, 1 << 19):
+                        write_all(file, data)
+            sha256 = self.add(whole, upload.id)
             self._inputs.finish_upload(upload.id, sha256, seconds)
         finally:
             whole.unlink(missing_ok=True)
         self.discard_upload(upload.id)
         return sha256
 
-    def _finish(self, upload: UploadRow, whole: Path) -> str:
-        """Turn an upload's bytes into a blob and a cached file, and return their SHA-256.
-
-        The parts are concatenated, on the server if possible, and the result is fetched once to hash and cache it.
-
-        Args:
-            whole: Temporary path for the complete file.
-
-        Raises:
-            FileNotFoundError: If a part is missing.
-        """
-        parts = self._inputs.parts(upload.id)
-        if sum(part.size for part in parts) != upload.length:
-            raise FileNotFoundError(upload.id)
-        self.ensure_space(upload.length)
-        joined = self._join(upload.id, parts)
-        if joined is None:
-            self._gather([part.location for part in parts], whole)
-            return self.add(whole, upload.id)
-        # hash the stored object itself, because it becomes the blob
-        self.objects.get(f"{BLOBS}/{joined}", whole)
-        sha256 = file_digest(whole)
-        self._take_in(sha256, joined, upload.length, upload.id, whole)
-        return sha256
-
-    def _join(self, upload_id: str, parts: Sequence[UploadPartRow]) -> str | None:
-        """Concatenate parts on the server and return the location of the new blob; None if that is not possible."""
-        if not self.objects.can_join([part.size for part in parts]):
-            return None
-        location = f"joined/{upload_id}-{secrets.token_hex(4)}"
-        try:
-            self.objects.join([part.location for part in parts], f"{BLOBS}/{location}")
-        except StoreError as error:
-            _log.warning("joining parts failed, sending the whole file: %s", error.__cause__)
-            return None
-        return location
-
-    def _gather(self, locations: list[str], whole: Path) -> None:
-        """Fetch the parts of an upload and concatenate them."""
-        piece = whole.with_suffix(".piece")
-        try:
-            with whole.open("wb", buffering=0) as file:
-                for location in locations:
-                    self.objects.get(location, piece)
-                    with piece.open("rb") as part:
-                        while data := part.read(1 << 20):
-                            write_all(file, data)
-        finally:
-            piece.unlink(missing_ok=True)
-
     def discard_upload(self, upload_id: str) -> None:
         """Remove the upload's objects."""
         self.objects.remove_below(f"{UPLOADS}/{upload_id}")
-
-    def collect(self) -> None:
-        """Remove expired uploads and unused blobs, and evict cached files that were in use."""
-        super().collect()
-        self._cache.evict()
 
 
 class _ObjectWriter(PartWriter):

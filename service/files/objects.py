@@ -41,8 +41,6 @@ _CONNECT_SECONDS, _ANSWER_SECONDS, _TRIES = 3.0, 10.0, 4
 #: Chunk size in bytes and number of concurrent chunks for transfers of large S3 objects; the defaults would use half a
 #: gigabyte of memory.
 _PIECE_BYTES, _PIECES = 16 << 20, 3
-#: Minimum and maximum size of an S3 object part in bytes (the last one may be smaller), and maximum number of parts.
-MIN_PART_BYTES, _MAX_PART_BYTES, _MAX_PARTS = 5 << 20, 5 << 30, 10_000
 #: Age in seconds at which files without a database row are removed, in a local folder and in a remote store; younger
 #: ones may not have their row yet.
 ORPHAN_SECONDS, REMOTE_ORPHAN_SECONDS = 3600.0, 6 * 3600.0
@@ -146,12 +144,9 @@ class ObjectStore:
     def stamp(self, name: str) -> Stamp:
         """Return metadata that change when the object's content changes."""
         with self._translated(name):
-            if self.local:
-                status = Path(self._path(name)).stat()
-                return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
             self._files.invalidate_cache()
             entry = self._files.info(self._path(name))
-            return entry["size"], _changed(entry), entry.get("ETag")
+            return entry["size"], _changed(entry), entry.get("ETag"), entry.get("ino")
 
     def size(self, name: str) -> int:
         """Return the size of an object in bytes; -1 if it does not exist."""
@@ -238,43 +233,6 @@ class ObjectStore:
         before = time.time() - (ORPHAN_SECONDS if self.local else REMOTE_ORPHAN_SECONDS)
         return sorted(name for name, changed in self.below(folder).items() if changed < before)
 
-    def can_join(self, sizes: list[int]) -> bool:
-        """Return whether the server can concatenate objects of these sizes itself, without another upload."""
-        fit = all(size >= MIN_PART_BYTES for size in sizes[:-1]) and max(sizes, default=0) <= _MAX_PART_BYTES
-        return self._s3 and 0 < len(sizes) <= _MAX_PARTS and fit
-
-    def join(self, parts: list[str], name: str) -> None:
-        """Concatenate objects on the server, by an S3 multipart upload with copied parts; see `can_join`."""
-        with self._translated(name):
-            target = dict(zip(("Bucket", "Key"), self._path(name).split("/", 1), strict=True))
-            created = self._files.call_s3("create_multipart_upload", **target)
-            target["UploadId"] = created["UploadId"]
-            try:
-                done = []
-                for number, part in enumerate(parts, 1):
-                    source = dict(zip(("Bucket", "Key"), self._path(part).split("/", 1), strict=True))
-                    copied = self._files.call_s3("upload_part_copy", **target, PartNumber=number, CopySource=source)
-                    done.append({"PartNumber": number, "ETag": copied["CopyPartResult"]["ETag"]})
-                self._files.call_s3("complete_multipart_upload", **target, MultipartUpload={"Parts": done})
-            except BaseException:
-                with contextlib.suppress(Exception):
-                    self._files.call_s3("abort_multipart_upload", **target)
-                raise
-            self._files.invalidate_cache()
-
-    def abort_old_parts(self) -> None:
-        """Abort multipart uploads that were started long ago and never finished."""
-        if not self._s3:
-            return
-        bucket, _, prefix = self.root.partition("/")
-        with self._translated(prefix):
-            listing = self._files.call_s3("list_multipart_uploads", Bucket=bucket, Prefix=prefix)
-            for entry in listing.get("Uploads", ()):
-                if entry["Initiated"].timestamp() < time.time() - REMOTE_ORPHAN_SECONDS:
-                    self._files.call_s3(
-                        "abort_multipart_upload", Bucket=bucket, Key=entry["Key"], UploadId=entry["UploadId"]
-                    )
-
     def ping(self) -> None:
         """Raise OSError or StoreError if the store cannot be reached."""
         with self._translated(self.root):
@@ -299,7 +257,7 @@ class ObjectStore:
 
     @contextlib.contextmanager
     def _translated(self, name: str) -> Iterator[None]:
-        """Convert all errors of a remote store, whatever library raises them, to `StoreError`.
+        """Convert all errors of a remote store, whatever library raises them, to `StoreError`, but not a full disk.
 
         A missing object of a missing bucket is no lost file: its store is away.
         """
@@ -311,6 +269,8 @@ class ObjectStore:
             if self.local or (isinstance(error, FileNotFoundError) and (not self._s3 or self._exists())):
                 raise
             error.add_note(f"store of files: {name}")  # for the operator's log
+            if is_full(error):
+                raise problems.NO_SPACE() from error
             raise problems.STORE_UNAVAILABLE() from error
 
 
@@ -346,8 +306,6 @@ def _changed(entry: dict[str, Any]) -> float:
     return modified.timestamp() if isinstance(modified, datetime) else float(modified or 0.0)
 
 
-#: Number of fetches with a wrong digest after which the file counts as damaged in the store.
-_FETCHES = 2
 #: Age in seconds at which partially fetched files are removed; no fetch takes that long, so their processes have died.
 _PARTIAL_SECONDS = 6 * 3600.0
 
@@ -385,84 +343,58 @@ class FileCache:
         Raises:
             LostFileError: If the store does not have the file.
             DamagedFileError: If the fetched file does not match its digest.
-            StoreError: If `fetch` raises it.
-            NoSpaceError: If the disk is full even after evicting all unused files.
+            StoreError, NoSpaceError: If `fetch` raises it.
         """
         if self._link(sha256, target):
             return
-        with self._locked(sha256[:2]):
+        with locked(self._locks / sha256[:2]):
             if self._link(sha256, target):
                 return
             self._fill(sha256, size, target, fetch)
         self.evict()
 
     def adopt(self, source: Path, sha256: str) -> None:
-        """Move a complete, verified file into the cache; if its content is already cached, `source` is deleted."""
-        with self._locked(sha256[:2]):
-            if self._path(sha256).exists():
-                source.unlink()
-            else:
-                self._add(source, sha256)
+        """Move a complete, verified file into the cache."""
+        with locked(self._locks / sha256[:2]):
+            self._add(source, sha256)
         self.evict()
 
     def evict(self, reserve: int = 0) -> None:
         """Evict the least recently used files that are not in use.
 
         Args:
-            reserve: Bytes to leave free below the limit.
+            reserve: Bytes to leave free below the limit, and on the disk.
         """
-        with self._locked("evict"):
-            total = self._total() + reserve
-            for path, status in sorted(self._entries(), key=lambda entry: entry[1].st_atime_ns):
-                if total <= self._limit:
+        with locked(self._locks / "evict"):
+            entries = sorted(self._entries(), key=lambda entry: entry[1].st_atime_ns)
+            total = sum(status.st_size for _, status in entries)
+            excess = reserve + max(total - self._limit, -shutil.disk_usage(self._files).free)
+            for path, status in entries:
+                if excess <= 0:
                     break
                 if status.st_nlink == 1:
                     path.unlink(missing_ok=True)
-                    total -= status.st_size
+                    excess -= status.st_size
             for path in self._partial.iterdir():
                 with contextlib.suppress(FileNotFoundError):
                     # ctime, because a complete file has a synthetic modification time shortly before it is moved
                     if path.stat().st_ctime < time.time() - _PARTIAL_SECONDS:
                         path.unlink()
 
-    def free(self, size: int) -> None:
-        """Evict unused files to free `size` bytes of disk space for other purposes."""
-        self.evict(self._limit - self._total() + size)
-
     def _fill(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
         self.evict(size)
-        partial, digest = self._partial / secrets.token_hex(8), ""
+        partial = self._partial / secrets.token_hex(8)
         try:
-            for _ in range(_FETCHES):
-                self._fetch(partial, fetch)
-                digest = file_digest(partial)
-                if digest == sha256:
-                    os.link(partial, target)  # link first: a file without other links could be evicted
-                    self._add(partial, sha256)
-                    return
+            fetch(partial)
+            if (digest := file_digest(partial)) != sha256:
+                _log.error("file damaged in the store: sha256=%s received=%s", sha256, digest)
+                raise problems.FILE_DAMAGED(sha256=sha256)
+            os.link(partial, target)  # link first: a file without other links could be evicted
+            self._add(partial, sha256)
         except FileNotFoundError as error:
             raise problems.FILE_LOST(sha256=sha256) from error
         finally:
             partial.unlink(missing_ok=True)
-        _log.error("file damaged in the store: sha256=%s received=%s", sha256, digest)
-        raise problems.FILE_DAMAGED(sha256=sha256)
-
-    def _fetch(self, partial: Path, fetch: Fetch) -> None:
-        """Fetch a file; if the disk is full, evict all unused files and retry."""
-        try:
-            fetch(partial)
-            return
-        except Exception as error:
-            if not is_full(error):
-                raise
-        partial.unlink(missing_ok=True)
-        self.evict(self._limit)
-        try:
-            fetch(partial)
-        except Exception as error:
-            if is_full(error):
-                raise problems.NO_SPACE(f"The disk of {self._files.parent} is full.") from error
-            raise
 
     def _add(self, source: Path, sha256: str) -> None:
         """Move a file into the cache.
@@ -494,29 +426,23 @@ class FileCache:
     def _path(self, sha256: str) -> Path:
         return self._files / sha256[:2] / sha256
 
-    def _total(self) -> int:
-        return sum(status.st_size for _, status in self._entries())
-
     def _entries(self) -> Iterator[tuple[Path, os.stat_result]]:
         for path in self._files.glob("*/*"):
             with contextlib.suppress(FileNotFoundError):
                 yield path, path.stat()
 
-    @contextlib.contextmanager
-    def _locked(self, name: str) -> Iterator[None]:
-        """Hold an exclusive lock against other processes and threads; the system releases it if the process dies."""
-        with (self._locks / name).open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold an exclusive lock of a file against other processes and threads; the system releases it if they die."""
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
-def is_full(error: BaseException | None) -> bool:
-    """Return whether an error, or one of its causes, reports a full disk."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in DISK_FULL:
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+def is_full(error: BaseException) -> bool:
+    """Return whether an error, or its cause, reports a full disk."""
+    return any(isinstance(each, OSError) and each.errno in DISK_FULL for each in (error, error.__cause__))
 
 
 #: Error numbers that mean that a hard link is impossible: different file systems, or no support for hard links.

@@ -92,7 +92,6 @@ class _Work:
         more: Bytes of the file in addition.
         options: Values for the inspecting process.
         others: Ids of other jobs whose results are needed, by the names of their staged files.
-        replaces: Whether the file replaces an earlier one.
         seconds, memory: CPU seconds and bytes of memory in addition to those for all such work.
     """
 
@@ -102,7 +101,6 @@ class _Work:
     more: int = _MORE_BYTES
     options: dict[str, Any] = field(default_factory=dict)
     others: dict[str, str] = field(default_factory=dict)
-    replaces: bool = False
     kind: Kind = "file"
     seconds: float = 0.0
     memory: int = 0
@@ -177,7 +175,7 @@ class DerivedFiles:
             viewer: Sources of the page; see `worker.derived`.
         """
         options = {"viewer": viewer, "title": job.name, "viewpoints": job.viewpoints or {}}
-        work = _Work("page", PAGE, _PAGE_SIZE, options=options, replaces=True)
+        work = _Work("page", PAGE, _PAGE_SIZE, options=options)
         return await self._existing(job, work.name) or await self._derived(job, work, quotas)
 
     async def poster(self, job: JobRow, start: dict[str, Any], quotas: Quotas) -> ArtifactRow:
@@ -192,7 +190,7 @@ class DerivedFiles:
         row = await self._existing(job, POSTER)
         if row is not None and job.viewpoints and job.viewpoints["start"] == start:
             return row
-        work = _Work("poster", POSTER, options={"viewpoint": start}, replaces=True)
+        work = _Work("poster", POSTER, options={"viewpoint": start})
         return await self._derived(job, work, quotas)
 
     async def set_viewpoints(self, job: JobRow, viewpoints: Viewpoints, quotas: Quotas) -> None:
@@ -224,7 +222,6 @@ class DerivedFiles:
             VIDEO,
             more=round(_VIDEO_BYTES_PER_PIXEL * pixels) + _MORE_BYTES,
             options={"video": options.model_dump(mode="json")},
-            replaces=True,
             kind="video",
             seconds=_VIDEO_SECONDS_PER_PIXEL * pixels + _VIDEO_SECONDS_PER_BYTE * size * options.frames,
             memory=MEMORY_PER_BYTE * size + _ENCODER_BYTES,
@@ -304,8 +301,7 @@ class DerivedFiles:
             if work.work == "compress":
                 files[f"{work.name}.json"] = loss = folder / "loss.json"
                 await run(loss.write_text, json.dumps(findings, indent=1) + "\n")
-            publish = partial(self._publish, replace=work.replaces)
-            await run(publish, job, result, files, quotas, size=most)
+            await run(self._publish, job, result, files, quotas, size=most)
 
     async def _stage(self, folder: Path, job: JobRow, results: Mapping[str, ArtifactRow]) -> Staged:
         """Stage the job's inputs, with results beside them, given by their names there."""
@@ -321,33 +317,19 @@ class DerivedFiles:
         size = sum(entry["size"] for entry in inputs) + sum(result.size for result in results.values())
         return await self._threads.run(job.owner, staging, size=size)
 
-    def _publish(
-        self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas, *, replace: bool = False
-    ) -> None:
-        """Charge the owner of a job for files derived from its result, store them, and make them visible.
-
-        The charge is a receipt until the files have rows. It ends if they cannot be stored, and expires if this process
-        dies.
-
-        Args:
-            replace: Whether files replace those of the same names.
+    def _publish(self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas) -> None:
+        """Store files derived from a job's result, and make them visible.
 
         Raises:
-            QUOTA_EXCEEDED: If they exceed the owner's quota of stored bytes; nothing is stored.
+            QUOTA_EXCEEDED: If they exceed the owner's quota of stored bytes; nothing remains stored.
         """
-        store, artifacts = self._store, self._artifacts
-        known = {row.name: row.size for row in store.jobs.artifacts(job.id)} if replace else {}
-        size = sum(path.stat().st_size - known.get(name, 0) for name, path in files.items())
-        receipt = store.inputs.open_receipt(job.owner, max(0, size), quotas)
         put: list[Published] = []
         unused: list[str] | None = None
         try:
             for name, path in files.items():
                 # later than the epoch of the last lease, so that the file is not swept as a leftover of an attempt
-                put.append(artifacts.put(job.id, job.lease_epoch + 1, name, path, final=True))
-            unused = store.jobs.add_derived(result, put, job.owner, quotas, replace=replace, receipt=receipt)
+                put.append(self._artifacts.put(job.id, job.lease_epoch + 1, name, path, final=True))
+            unused = self._store.jobs.add_derived(result, put, job.owner, quotas)
         finally:
-            if unused is None:
-                store.inputs.end_receipt(receipt)
             for location in [file.location for file in put] if unused is None else unused:
-                artifacts.objects.remove(location)
+                self._artifacts.objects.remove(location)

@@ -12,7 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,12 +42,7 @@ class Lanes:
 
     def __init__(self, count: int) -> None:
         self._free, self._own = asyncio.Semaphore(count), OwnerLimit(1)
-        self._waiting: Counter[str] = Counter()
-
-    @property
-    def full(self) -> bool:
-        """Whether a request would have to wait."""
-        return self._free.locked()
+        self._present: Counter[str] = Counter()
 
     @asynccontextmanager
     async def turn(self, owner: str) -> AsyncIterator[None]:
@@ -56,17 +51,15 @@ class Lanes:
         Raises:
             BUSY: If too many requests of this owner wait already.
         """
-        if self._waiting[owner] >= MAX_WAITING:
+        if self._present[owner] > MAX_WAITING:  # one of them has its turn
             raise problems.BUSY("Too many files of this key are being checked. Try again later.")
-        async with AsyncExitStack() as stack:
-            self._waiting[owner] += 1
-            try:
-                # in this order, one request of each owner waits for its turn, behind those of the other owners
-                await stack.enter_async_context(self._own.of(owner))
-                await stack.enter_async_context(self._free)
-            finally:
-                self._waiting -= Counter([owner])
-            yield
+        self._present[owner] += 1
+        try:
+            # in this order, one request of each owner waits for its turn, behind those of the other owners
+            async with self._own.of(owner), self._free:
+                yield
+        finally:
+            self._present -= Counter([owner])
 
 
 #: Task of the inspecting process: validate a job's inputs, or plan the job as well.
@@ -90,6 +83,9 @@ _MEMORY_FRACTION = 0.8
 #: Maximum size of the file of a plan, in bytes per Gaussian of the refined scene and besides, and number of plans that
 #: are stored.
 _PLAN_BYTES_PER_GAUSSIAN, _PLAN_BYTES, _MAX_PLANS = 32, 1 << 20, 16
+#: CPU seconds that planning may take per Gaussian and view, per pixel of each view, and per pixel of the view that the
+#: trial visits. Actual use is less than a third of them.
+_SECONDS_PER_GAUSSIAN, _SECONDS_PER_PIXEL, _TRIAL_SECONDS_PER_PIXEL = 5e-6, 5e-6, 2e-4
 #: Total size in bytes above which a job is large.
 _LARGE_BYTES = 64 << 20
 
@@ -118,22 +114,29 @@ class InspectionProcess:
         self._process: asyncio.subprocess.Process | None = None
         self._starting = asyncio.Lock()
 
-    async def ask(
-        self, request: WorkRequest, show: Show = lambda now: None, checked: Show = lambda findings: None
-    ) -> dict[str, Any]:
+    async def ask(self, request: WorkRequest, show: Show = lambda now: None) -> dict[str, Any]:
         """Return the response to a request.
 
-        Args:
-            checked: Callback for the findings about the inputs of a job that is then planned.
-
         Raises:
-            BUSY: If the process died twice.
+            BUSY: If the process died.
         """
         line = request.model_copy(update={"threads": self.threads}).model_dump_json().encode() + b"\n"
-        for _ in range(2):
-            answer = await self._exchange(line, show, checked)
-            if answer is not None:
-                return answer
+        process, answered = await self.start(), False
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            with suppress(OSError, ValueError):
+                process.stdin.write(line)
+                await process.stdin.drain()
+                while response := await process.stdout.readline():
+                    answer: dict[str, Any] = json.loads(response)
+                    if "planning" not in answer:
+                        answered = True
+                        return answer
+                    show(answer["planning"])
+        finally:
+            if not answered:  # a later response must not be read as that of another request
+                await self.close()
         raise problems.BUSY("Files cannot be checked at the moment. Try again later.")
 
     async def start(self) -> asyncio.subprocess.Process:
@@ -149,32 +152,6 @@ class InspectionProcess:
                     start_new_session=True,
                 )
             return self._process
-
-    async def _exchange(self, line: bytes, show: Show, checked: Show) -> dict[str, Any] | None:
-        process = await self.start()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        try:
-            process.stdin.write(line)
-            await process.stdin.drain()
-            while response := await process.stdout.readline():
-                answer: dict[str, Any] = json.loads(response)
-                if "planning" in answer:
-                    show(answer["planning"])
-                elif "checked" in answer:
-                    checked(answer["checked"])
-                else:
-                    return answer
-            return None
-        except (OSError, ValueError):
-            await self.close()  # further output must not be read as the response to a later request
-            return None
-        except asyncio.CancelledError:  # else the pending response would be read as that of the next request
-            await self.close()
-            raise
-        finally:
-            if process.returncode is None and process.stdout.at_eof():
-                await self.close()
 
     def _environment(self) -> dict[str, str]:
         """Return the environment variables of the process.
@@ -226,10 +203,6 @@ class Processes:
         self._all.append(InspectionProcess(threads))
         return self._all[-1]
 
-    def is_busy(self, kind: Kind) -> bool:
-        """Return whether work of this kind would have to wait."""
-        return self._lanes[kind].full
-
     async def warm(self) -> None:
         """Start processes that check and plan jobs in advance: their imports take seconds."""
         for threads in {1, self._threads["plan"]}:
@@ -260,7 +233,6 @@ class Inspector:
         self._settings = settings
         self._store, self._blobs, self._threads = store, blobs, threads
         self.processes = Processes(settings)
-        self._warming: asyncio.Task[None] | None = None
         self._folder = working_folder(settings, "inspections")
         for feature in missing():
             _log.warning("confinement incomplete: missing %s", feature)
@@ -284,18 +256,16 @@ class Inspector:
         rows: Mapping[str, BlobRow],
         parameters: JobParameters,
         show: Show = lambda now: None,
-        checked: Callable[[], None] = lambda: None,
     ) -> dict[str, Any]:
         """Return the findings of `service.inspection.process` about a job's inputs.
 
         Args:
-            work: Task; "plan" validates the inputs too.
+            work: Task; inputs that are planned are validated first.
             owner: Owner of the job; waiting owners take turns.
             inputs: `role`, `name`, `sha256` and `size` of each file.
             rows: Blob rows by digest.
             show: Callback that receives the progress of planning: `stage`, `step`, `total`, `fraction` and `eta_s`. One
                 step is one view.
-            checked: Callback after the inputs have been read and found usable.
 
         Raises:
             INVALID_INPUT: If the inputs cannot be used.
@@ -303,14 +273,17 @@ class Inspector:
         """
         recalled = await asyncio.to_thread(self.recall, work, owner, inputs, parameters)
         if recalled is not None:
-            checked()
             return recalled
+        seconds = self._settings.inspection_seconds + _SECONDS_PER_BYTE * _size(inputs)
+        if work == "plan" or parameters.renders_views:
+            seconds += self._settings.dry_run_seconds
+        if work == "plan":
+            valid = await self.inspect("validate", owner, inputs, rows, parameters)
+            seconds += _planning_seconds(valid, _limits(self._settings))
         kind: Kind = "plan" if work == "plan" else "large" if _size(inputs) > _LARGE_BYTES else "validate"
         with suspended():  # the process has its own limits
             async with self.processes.turn(owner, kind) as process:
-                if self._settings.keys_required and self._warming is None:  # without keys there is only one owner
-                    self._warming = asyncio.create_task(self.processes.warm())
-                answer = await self._ask_process(process, work, owner, inputs, rows, parameters, show, checked)
+                answer = await self._ask_process(process, work, owner, inputs, rows, parameters, seconds, show)
         transient = answer.get("error", {}).get("code") in (problems.INSPECTION_LIMIT.code, WeightsError.code)
         if not transient:  # a later check may succeed
             key = _key(self._settings, work, owner, inputs, parameters)
@@ -325,12 +298,9 @@ class Inspector:
         inputs: Sequence[Mapping[str, Any]],
         rows: Mapping[str, BlobRow],
         parameters: JobParameters,
+        seconds: float,
         show: Show,
-        checked: Callable[[], None],
     ) -> dict[str, Any]:
-        seconds = self._settings.inspection_seconds + _SECONDS_PER_BYTE * _size(inputs)
-        if work == "plan" or parameters.renders_views:
-            seconds += self._settings.dry_run_seconds
         async with self._threads.folder(owner, self._folder) as folder:
             paths = await self._threads.run(owner, self._blobs.fetch, rows, folder, size=_size(inputs))
             staged = await self._threads.run(owner, stage, folder, inputs, paths)
@@ -345,19 +315,8 @@ class Inspector:
                 limits=_limits(self._settings),
                 output=(PLAN, most) if work == "plan" else None,
             )
-            if work != "plan":
-                return await process.ask(request, show)
-            valid: dict[str, Any] = {}
-
-            def note(findings: dict[str, Any]) -> None:
-                valid.update(findings)
-                checked()
-
-            answer = await process.ask(request, show, note)
-            if valid:
-                key = _key(self._settings, "validate", owner, inputs, parameters)
-                await asyncio.to_thread(self._store.inputs.add_inspection, key, {"findings": valid})
-            if "findings" in answer:
+            answer = await process.ask(request, show)
+            if request.output and "findings" in answer:
                 target = stored_plan(self._settings, owner, inputs, parameters)
                 await self._threads.run(owner, _store_plan, folder / PLAN, target)
             return answer
@@ -378,6 +337,13 @@ def _limits(settings: ServiceSettings) -> dict[str, int]:
         "pixels": settings.max_pixels,
         "image_pixels": settings.max_image_pixels,
     }
+
+
+def _planning_seconds(findings: dict[str, Any], limits: dict[str, int]) -> float:
+    """Return the CPU seconds that planning may take, from the findings of an untrusted process about the inputs."""
+    gaussians, views, pixels = (min(max(findings[name], 0), limits[name]) for name in ("gaussians", "views", "pixels"))
+    trial = _TRIAL_SECONDS_PER_PIXEL * pixels / max(views, 1)
+    return float(_SECONDS_PER_GAUSSIAN * gaussians * views + _SECONDS_PER_PIXEL * pixels + trial)
 
 
 def _key(

@@ -4,7 +4,7 @@ The process imports slow modules once. For each request it forks a child with li
 files and exits. The child is confined (`service.inspection.sandbox`): a hostile file that takes over the child can
 falsify the response to its own request and the one file that the request lets it write, and nothing else. Requests and
 responses are lines of JSON on stdin and stdout, one request at a time. The final response of work that takes long is
-preceded by lines of progress, `{"planning": ...}`, and that of a plan by the findings of the check, `{"checked": ...}`.
+preceded by lines of progress, `{"planning": ...}`.
 """
 
 from __future__ import annotations
@@ -73,9 +73,6 @@ MAX_ANSWER = 64 << 20
 MAX_REPORTS = 10_000
 #: Fields of a progress message; all but the first are numbers.
 _PROGRESS = {"stage", "step", "total", "fraction", "eta_s"}
-#: CPU seconds that planning may take per Gaussian and view, per pixel of each view, and per pixel of the view that the
-#: trial visits. Actual use is less than a third of them.
-_SECONDS_PER_GAUSSIAN, _SECONDS_PER_PIXEL, _TRIAL_SECONDS_PER_PIXEL = 5e-6, 5e-6, 2e-4
 #: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
 _THREAD_BYTES = 1 << 28
 #: Remaining weight (1 minus the sum of weights) up to which it counts as zero, because floats are rounded.
@@ -166,7 +163,6 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
     started = time.perf_counter()
     inputs, settings = _read(request), request.parameters.settings()
     findings, spec = _findings(inputs), job_spec(request.staged, request.parameters)
-    send({"checked": findings})
     if isinstance(inputs, PaintInputs):
         return {
             **findings,
@@ -330,19 +326,12 @@ def _over_limit(message: str, role: str | None = None) -> dict[str, Any]:
     return _refusal(problems.INSPECTION_LIMIT.code, message, role)
 
 
-def _limit_resources(seconds: float, size: int, *, extended: bool) -> None:
-    """Limit this child's CPU time and memory; `extended` lets the parent allow more time."""
+def _limit_resources(seconds: float, size: int) -> None:
+    """Limit this child's CPU time and memory."""
     used = psutil.Process().memory_info().vms
     resource.setrlimit(resource.RLIMIT_AS, (used + size, used + size))
     cpu = max(1, int(seconds))
-    resource.setrlimit(resource.RLIMIT_CPU, (cpu, resource.RLIM_INFINITY if extended else cpu + 1))
-
-
-def _planning_seconds(findings: dict[str, Any], limits: dict[str, int]) -> float:
-    """Return the CPU seconds that planning may take, from an untrusted child's findings about the inputs."""
-    gaussians, views, pixels = (min(max(findings[name], 0), limits[name]) for name in ("gaussians", "views", "pixels"))
-    trial = _TRIAL_SECONDS_PER_PIXEL * pixels / max(views, 1)
-    return float(_SECONDS_PER_GAUSSIAN * gaussians * views + _SECONDS_PER_PIXEL * pixels + trial)
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu, cpu + 1))
 
 
 def _inspect_in_child(request: WorkRequest) -> Iterator[bytes]:
@@ -358,18 +347,9 @@ def _inspect_in_child(request: WorkRequest) -> Iterator[bytes]:
         _run_child(request, writing)
     os.close(writing)
     answer, until = None, time.monotonic() + 2 * request.seconds
-    lines, is_planning = _lines(reading, lambda: until), False
     try:
-        for number, line in enumerate(lines):
-            if "checked" in line:
-                if request.work != "plan" or is_planning:
-                    break
-                is_planning = True
-                seconds = _planning_seconds(line["checked"], request.limits)
-                until += 2 * seconds
-                most = int((request.seconds + seconds) * request.threads)
-                resource.prlimit(child, resource.RLIMIT_CPU, (most, most + 1))
-            elif "planning" not in line:
+        for number, line in enumerate(_lines(reading, until)):
+            if "planning" not in line:
                 answer = line
                 break
             if number < MAX_REPORTS:
@@ -399,8 +379,7 @@ def _run_child(request: WorkRequest, writing: int) -> NoReturn:
         with contextlib.suppress(OSError):  # if the machine runs out of memory, the kernel kills this rather than a job
             Path("/proc/self/oom_score_adj").write_text("500")
         # RLIMIT_CPU counts all threads, even those that spin
-        memory, extended = request.memory + _memory_besides_reading(request), request.work == "plan"
-        _limit_resources(request.seconds * request.threads, memory, extended=extended)
+        _limit_resources(request.seconds * request.threads, request.memory + _memory_besides_reading(request))
         with os.fdopen(writing, "w") as file:
 
             def send(response: dict[str, Any]) -> None:
@@ -464,22 +443,17 @@ def _compile_kernels() -> None:
         _close_descriptors()
         with tempfile.TemporaryDirectory() as folder:
             os.chdir(folder)
-            count, scene = 64, Path("scene.ply")
+            scene = Path("scene.ply")
             shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh_dc": (3,), "sh_rest": (15, 3)}
-            write_scene(scene, Scene(*(torch.rand(count, *shape) for shape in shapes.values())))
-            staged, parameters = (
-                Staged(scene=scene, styles=(STARRY_NIGHT,), cameras=None, photos=None),
-                JobParameters(orbit="3", resolution=96),
-            )
-            limits = dict.fromkeys(("gaussians", "views", "pixels", "image_pixels"), 1 << 40)
+            write_scene(scene, Scene(*(torch.rand(64, *shape) for shape in shapes.values())))
             request = WorkRequest(
                 work="plan",
                 folder=Path(folder),
-                staged=staged,
-                parameters=parameters,
+                staged=Staged(scene=scene, styles=(STARRY_NIGHT,), cameras=None, photos=None),
+                parameters=JobParameters(orbit="3", resolution=96),
                 seconds=0,
                 memory=0,
-                limits=limits,
+                limits=dict.fromkeys(("gaussians", "views", "pixels", "image_pixels"), 1 << 40),
             )
             _plan(request, lambda response: None)
     finally:
@@ -502,10 +476,10 @@ def _limit_text(request: WorkRequest) -> str:
     return text if request.work != "plan" else f"{text} Ask for fewer views, or submit it without a dry run."
 
 
-def _lines(descriptor: int, deadline: Callable[[], float]) -> Iterator[dict[str, Any]]:
+def _lines(descriptor: int, until: float) -> Iterator[dict[str, Any]]:
     """Yield messages until the child closes the pipe or sends an invalid message, or the deadline passes."""
     incomplete = b""
-    while (left := deadline() - time.monotonic()) > 0 and len(incomplete) < MAX_ANSWER:
+    while (left := until - time.monotonic()) > 0 and len(incomplete) < MAX_ANSWER:
         if not select.select([descriptor], [], [], left)[0]:
             continue
         data = os.read(descriptor, 1 << 16)
@@ -524,12 +498,7 @@ def _lines(descriptor: int, deadline: Callable[[], float]) -> Iterator[dict[str,
 
 def _is_response(answer: Any) -> bool:
     """Return whether the message of an untrusted child has the format that the calling process accepts."""
-    if not isinstance(answer, dict) or not answer.keys() & {"planning", "checked", "findings", "error"}:
-        return False
-    checked = answer.get("checked", {"gaussians": 0, "views": 0, "pixels": 0})
-    if not isinstance(checked, dict) or not all(
-        isinstance(checked.get(name), int) for name in ("gaussians", "views", "pixels")
-    ):
+    if not isinstance(answer, dict) or not answer.keys() & {"planning", "findings", "error"}:
         return False
     planning = answer.get("planning", {})
     if not isinstance(planning, dict) or (planning and planning.keys() != set(_PROGRESS)):

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.inputs import PLAN
-from service.scheduling.messages import OUTAGE, Ending, Report, Task, cause_of_error, outage
+from service.scheduling.messages import OUTAGE, Ending, Report, Task, cause_of_error, failure
 from service.states import AttemptOutcome, Cause
 from sgsst_core.progress import Progress
 from worker.processes import die_with_parent, process_start
@@ -87,22 +87,6 @@ def report_prepared(prepared: Prepared) -> None:
     for heading, line in prepared.lines:
         log(f"{heading}: {line}")
     send(Report(prepared=True))
-
-
-def failure(error: Exception) -> Ending:
-    """Return the ending for an error; the error is permanent if a retry would fail in the same way."""
-    from sgsst_core.errors import DivergedError, InvalidInputError, SgsstError, is_out_of_memory
-
-    cause = cause_of_error(error)
-    if cause != Cause.JOB:
-        detail = "".join(traceback.format_exception(error))
-        return Ending(AttemptOutcome.FAILED, error=outage(cause), detail=detail)
-    code = error.code if isinstance(error, SgsstError) else "out-of-memory" if is_out_of_memory(error) else "internal"
-    message = (
-        str(error) if isinstance(error, SgsstError) or is_out_of_memory(error) else f"{type(error).__name__}: {error}"
-    )
-    permanent = isinstance(error, InvalidInputError | DivergedError)
-    return Ending(AttemptOutcome.FAILED, error={"code": code, "message": message}, permanent=permanent)
 
 
 def log(line: str) -> None:

@@ -26,7 +26,8 @@ from service.files.blobs import Blobs
 from service.files.objects import Artifacts
 from service.inputs import CHECKPOINT, PLAN, job_spec, layout, stage, stored_parameters
 from service.inspection.inspector import stored_plan
-from service.problems import LeaseLostError, ServiceError, StoreError
+from service.problems import LeaseLostError
+from service.scheduling.attempt_files import PATIENCE_SECONDS, Publisher, fetch_checkpoint, store_weights
 from service.scheduling.capacity import Grant
 from service.scheduling.messages import (
     Ending,
@@ -35,18 +36,14 @@ from service.scheduling.messages import (
     StoreWorkplace,
     Task,
     attempt_ending,
-    cause_of_error,
-    outage,
+    failure,
 )
-from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
-from service.scheduling.rank_folder import fetch_checkpoint, store_weights
 from service.settings import ServiceSettings
-from service.states import AttemptOutcome, Cause, JobStatus, Published
+from service.states import AttemptOutcome, JobStatus, Published
 from service.store import Store
 from service.store.files import BLOBS
 from service.store.queue import Lease, cause_of
 from service.store.tables import ArtifactRow, BlobRow
-from sgsst_core.errors import SettingsError
 from sgsst_core.progress import Progress
 from worker.job import JobSpec
 
@@ -277,15 +274,10 @@ class RunningAttempt:
         except LeaseLostError:
             _log.warning("lease lost to another dispatcher", extra=self.lease.log_fields)
         except Exception as error:
-            _log.exception("attempt failed unexpectedly", extra=self.lease.log_fields)
-            reported = (
-                {"code": error.code, "message": str(error)}
-                if isinstance(error, ServiceError)
-                else {"code": "internal", "message": f"{type(error).__name__}: {error}"}
-            )
-            cause = cause_of_error(error)
+            _log.exception("attempt failed", extra=self.lease.log_fields)
+            ending = failure(error)
             with contextlib.suppress(Exception):
-                self._fail(reported if cause == Cause.JOB else outage(cause), permanent=False)
+                self._fail(ending.error or {}, permanent=ending.permanent)
         finally:
             self._kill()
             removed = self._files.submit(shutil.rmtree, self._folder, ignore_errors=True)
@@ -317,11 +309,7 @@ class RunningAttempt:
             self._pending.popleft().result()
 
     def _attempt(self) -> None:
-        try:
-            spec = job_spec(layout(self.lease.job.inputs)[0], stored_parameters(self.lease.job.parameters))
-        except SettingsError as error:
-            self._fail({"code": error.code, "message": str(error)}, permanent=True)
-            return
+        spec = job_spec(layout(self.lease.job.inputs)[0], stored_parameters(self.lease.job.parameters))
         if self.grant.gpus:
             self._store.leases.hold_gpus(self.lease, len(self.grant.gpus))
         prepare = partial(self._stager.prepare, self._folder, self.lease, self.grant, spec)
@@ -351,10 +339,8 @@ class RunningAttempt:
             result = {} if ending.result is None else ending.result.model_dump()
             succeed = partial(self._publisher.succeed, result, lambda: self._stop_request == StopRequest.ABANDON)
             self._within(succeed, 2 * PATIENCE_SECONDS)
-            self._sweep()
         elif ending.outcome == AttemptOutcome.CANCELED:
             self._store.leases.stop(self.lease)
-            self._sweep()
         elif ending.outcome == AttemptOutcome.RELEASED:
             self._store.leases.release(self.lease)
         else:
@@ -408,13 +394,6 @@ class RunningAttempt:
         retried = self._store.leases.fail(self.lease, error, permanent=permanent)
         outcome = "job will be retried" if retried else "job failed"
         _log.warning("%s: cause=%s: %s", outcome, cause_of(error), error["message"], extra=self.lease.log_fields)
-        if not retried:
-            self._sweep()
-
-    def _sweep(self) -> None:
-        """Remove leftovers of the ended job; housekeeping removes those that remain."""
-        with contextlib.suppress(StoreError):
-            self._within(self._publisher.sweep)
 
 
 class ProgressWriter:

@@ -23,6 +23,7 @@ import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from service.inputs import JobParameters, stored_parameters
 from service.settings import ServiceSettings
 from service.store.tables import JobRow
 from sgsst_core import container
@@ -168,10 +169,12 @@ class Capacity:
         slots = self._free_slots(held)
         if slots < 1:
             return None
-        requested = _requested(job, "workers")
+        parameters, settings = _stored_settings(job)
+        scene = _scene_bytes(job, settings)
         if self._machine.gpus:
-            return self._on_gpus(job, requested, held, min(max(waiting, 1), slots))
-        return self._on_cores(job, requested or 1, slots)
+            seconds = _seconds_of_steps(job, parameters, settings, scene)
+            return self._on_gpus(parameters.workers, seconds, scene, held, min(max(waiting, 1), slots))
+        return self._on_cores(parameters.workers or 1, settings.memory_limit, scene, slots)
 
     def _free_gpus(self, held: list[Grant]) -> list[str]:
         taken = {gpu for grant in held for gpu in grant.gpus}
@@ -180,74 +183,62 @@ class Capacity:
     def _free_slots(self, held: list[Grant]) -> int:
         return self._slots - sum(grant.slots for grant in held)
 
-    def _on_gpus(self, job: JobRow, requested: int, held: list[Grant], sharers: int) -> Grant | None:
+    def _on_gpus(
+        self, requested: int | None, seconds: float, scene: int, held: list[Grant], sharers: int
+    ) -> Grant | None:
         free = self._free_gpus(held)
         if requested:
             ranks = min(requested, len(self._machine.gpus))
         else:
-            portion = max(1, len(free) // sharers)
-            ranks = min(portion, 1 + int(_seconds_of_steps(job) / _SECONDS_PER_GPU))
+            ranks = min(max(1, len(free) // sharers), 1 + int(seconds / _SECONDS_PER_GPU))
         if ranks > len(free):
             return None
-        grant = Grant(ranks, tuple(free[:ranks]), scene=_scene_bytes(job))
+        grant = Grant(ranks, tuple(free[:ranks]), scene=scene)
         if not held or self._machine.cluster:  # a job that runs alone is started even if memory may be short
             return grant
         together = sum(each.host_bytes for each in (grant, *held))
         return grant if together <= _MEMORY_FRACTION * self._machine.memory else None
 
-    def _on_cores(self, job: JobRow, ranks: int, free: int) -> Grant | None:
+    def _on_cores(self, ranks: int, requested: int | None, scene: int, free: int) -> Grant | None:
         if self._machine.cluster:
             return Grant(ranks)
-        requested = _requested(job, "memory_limit")
         most = int(_JOB_FRACTION * self._machine.memory)
         if self._slots == 1:
             return Grant(ranks, memory=min(requested, most) if requested else None)
         portion = _MEMORY_FRACTION * self._machine.memory / self._slots
-        scene = _SCENE_COPIES * _scene_bytes(job)
-        slots = min(math.ceil((scene + (requested or _MIN_MEMORY)) / portion), self._slots)
+        scenes = _SCENE_COPIES * scene
+        slots = min(math.ceil((scenes + (requested or _MIN_MEMORY)) / portion), self._slots)
         if slots > free:
             return None
-        limit = max(min(most, int(slots * portion - scene)), _MIN_MEMORY)
+        limit = max(min(most, int(slots * portion - scenes)), _MIN_MEMORY)
         threads = max(1, self._machine.cores * slots // self._slots)
         return Grant(ranks, (), slots, threads, min(requested or limit, limit))
 
 
-def _seconds_of_steps(job: JobRow) -> float:
+def _seconds_of_steps(job: JobRow, parameters: JobParameters, settings: Settings, scene: int) -> float:
     """Estimate the duration of all steps of a job on one GPU in seconds; 0 for painted views, which have no steps."""
     if any(entry["role"] == "painted" for entry in job.inputs):
         return 0.0
-    settings = _settings(job)
-    side = min(_requested(job, "resolution") or _LONGER_SIDE, settings.max_resolution or math.inf)
+    side = min(parameters.resolution or _LONGER_SIDE, settings.max_resolution or math.inf)
     scales = scale_count(int(_ASPECT * side), int(side), settings.coarsest_side)
     evaluated = ScaleWeights(settings.scales).evaluated(scales, settings.scale_sampling)
     network = _PIXEL_SECONDS[settings.precision] * _ASPECT * side**2 * evaluated
-    step = _FIXED_SECONDS + _GAUSSIAN_SECONDS * _scene_bytes(job) / GAUSSIAN_BYTES + network
+    step = _FIXED_SECONDS + _GAUSSIAN_SECONDS * scene / GAUSSIAN_BYTES + network
     steps = settings.steps_sos + _COARSE_FRACTION * settings.steps_coarse
     return min(settings.views_per_step * steps * step, settings.within or math.inf)
 
 
-def _settings(job: JobRow) -> Settings:
+def _stored_settings(job: JobRow) -> tuple[JobParameters, Settings]:
     """Return the settings of a job; the defaults if another version has stored them, which the attempt rejects."""
-    known = Settings.model_fields.keys() - {"preset"}
-    given = {name: value for name, value in job.parameters.items() if name in known}
     try:
-        return make_settings(job.parameters.get("preset", "standard"), **given)
-    except (SettingsError, TypeError):
-        return make_settings()
+        parameters = stored_parameters(job.parameters)
+        return parameters, parameters.settings()
+    except SettingsError:
+        return JobParameters(), make_settings()
 
 
-def _scene_bytes(job: JobRow) -> int:
+def _scene_bytes(job: JobRow, settings: Settings) -> int:
     """Return the size of a job's scene in bytes, once it is read and refined."""
     files = [entry for entry in job.inputs if entry["role"] == "scene"]
     size = sum(scene_bytes(str(entry.get("name", "")), entry["size"]) for entry in files)
-    return int(size * _settings(job).growth)
-
-
-def _requested(job: JobRow, name: str) -> int:
-    """Return an integer parameter of a job; 0 if it is missing or has another type.
-
-    Other types were stored by an earlier version of the service. The attempt will reject them, so they need no
-    capacity.
-    """
-    value = job.parameters.get(name)
-    return max(value, 0) if isinstance(value, int) else 0
+    return int(size * settings.growth)

@@ -14,8 +14,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from types import FrameType
+from collections.abc import Callable, Sequence
 
 from service.files.blobs import open_blobs
 from service.files.objects import Artifacts
@@ -36,50 +35,6 @@ RENEW_FRACTION, _ABANDON_FRACTION = 1 / 3, 3 / 4
 _CHECK_FRACTION = RENEW_FRACTION * (1 - _ABANDON_FRACTION)
 
 _log = logging.getLogger(__name__)
-
-
-class LeaseKeeper:
-    """Keeper of leases: it renews them, and ends attempts whose jobs are canceled or whose leases are lost.
-
-    Args:
-        seconds: Duration of a lease.
-        running: Running attempts by job id, which the dispatcher updates.
-    """
-
-    def __init__(self, store: Store, seconds: float, running: Mapping[str, RunningAttempt]) -> None:
-        self._store, self._seconds, self._running = store, seconds, running
-        self._renewed_at = float("-inf")
-
-    def update(self) -> None:
-        """Renew all leases if that is due, and pass the statuses of the jobs to their attempts; abandon lost jobs."""
-        now = time.monotonic()  # taken before the request, so that a lease is never assumed to last too long
-        if not self._running:
-            self._renewed_at = now
-            return
-        leases = [attempt.lease for attempt in self._running.values()]
-        if now - self._renewed_at >= RENEW_FRACTION * self._seconds:
-            statuses = self._store.leases.renew(leases)
-            self._renewed_at = now
-        else:
-            statuses = self._store.leases.statuses(leases)
-        for job_id, status in statuses.items():
-            attempt = self._running[job_id]
-            if status is not None:
-                attempt.obey(status)
-            elif attempt.alive:
-                attempt.abandon()
-
-    def abandon_late(self) -> None:
-        """Abandon jobs whose leases could not be renewed, before the leases expire.
-
-        A thread of its own calls this, because the thread that renews leases may wait for a database that does not
-        respond.
-        """
-        late = time.monotonic() - self._renewed_at
-        if late > _ABANDON_FRACTION * self._seconds:
-            for attempt in [each for each in dict(self._running).values() if not each.abandoned]:
-                _log.error("attempt abandoned: lease not renewed for %.0f s", late, extra=attempt.lease.log_fields)
-                attempt.abandon()
 
 
 def lease_next_job(
@@ -130,19 +85,14 @@ class Dispatcher:
         self._capacity = Capacity(machine, settings.parallel_jobs)
         self._work = settings.folder / "work" / self.name
         self._running: dict[str, RunningAttempt] = {}
-        self._announced_at = float("-inf")
+        self._announced_at = self._renewed_at = float("-inf")
         self._stop, self._ended = threading.Event(), threading.Event()
         blobs = open_blobs(settings, store.inputs, self._artifacts)
         self._stager = Stager(settings, store, blobs, self._artifacts, cluster=machine.cluster)
-        self._lease_keeper = LeaseKeeper(store, settings.lease_seconds, self._running)
         #: Periodic work in threads of its own, because it may wait for the database, files or receivers: name,
         #: interval in seconds, and function.
         self._helpers = [
-            (
-                "lease-keeper",
-                _CHECK_FRACTION * settings.lease_seconds,
-                self._lease_keeper.abandon_late,
-            ),
+            ("lease-keeper", _CHECK_FRACTION * settings.lease_seconds, self._abandon_late),
             ("housekeeper", _HOUSEKEEPING_SECONDS, Housekeeper(store, self._artifacts, blobs).clean_up),
         ]
         if settings.webhooks:
@@ -187,17 +137,14 @@ class Dispatcher:
             if is_dead(name):
                 _log.info("taking over jobs of a dead dispatcher: name=%s", name)
                 self._store.leases.expire(name)
-                self._store.operations.remove_dispatcher(name)
         if self._work.parent.is_dir():
             for path in self._work.parent.iterdir():
                 if is_dead(path.name):
                     shutil.rmtree(path, ignore_errors=True)
 
     def _work_once(self) -> None:
-        for job_id, attempt in list(self._running.items()):
-            if not attempt.alive:
-                del self._running[job_id]
-        self._lease_keeper.update()
+        self._running = {job_id: attempt for job_id, attempt in self._running.items() if attempt.alive}
+        self._update_leases()
         if time.monotonic() - self._announced_at >= RENEW_FRACTION * self._settings.lease_seconds:
             free = self._capacity.free([attempt.grant for attempt in self._running.values()])
             self._store.operations.record_heartbeat(self.name, self._capacity.size, free)
@@ -217,6 +164,34 @@ class Dispatcher:
             self._running[lease.job_id] = attempt
             attempt.start()
 
+    def _update_leases(self) -> None:
+        """Renew all leases if that is due, and pass the statuses of the jobs to their attempts; abandon lost jobs."""
+        now = time.monotonic()  # taken before the request, so that a lease is never assumed to last too long
+        leases = [attempt.lease for attempt in self._running.values()]
+        if now - self._renewed_at >= RENEW_FRACTION * self._settings.lease_seconds or not leases:
+            statuses = self._store.leases.renew(leases) if leases else {}
+            self._renewed_at = now
+        else:
+            statuses = self._store.leases.statuses(leases)
+        for job_id, status in statuses.items():
+            attempt = self._running[job_id]
+            if status is not None:
+                attempt.obey(status)
+            elif attempt.alive:
+                attempt.abandon()
+
+    def _abandon_late(self) -> None:
+        """Abandon jobs whose leases could not be renewed, before the leases expire.
+
+        A thread of its own calls this, because the thread that renews leases may wait for a database that does not
+        respond.
+        """
+        late = time.monotonic() - self._renewed_at
+        if late > _ABANDON_FRACTION * self._settings.lease_seconds:
+            for attempt in [each for each in dict(self._running).values() if not each.abandoned]:
+                _log.error("attempt abandoned: lease not renewed for %.0f s", late, extra=attempt.lease.log_fields)
+                attempt.abandon()
+
     def _shut_down(self) -> None:
         _log.info("dispatcher stopping: running_jobs=%d", len(self._running))
         for attempt in self._running.values():
@@ -225,7 +200,7 @@ class Dispatcher:
             self._store.operations.remove_dispatcher(self.name)
         while any(attempt.alive for attempt in self._running.values()):
             with contextlib.suppress(Exception):
-                self._lease_keeper.update()
+                self._update_leases()
             time.sleep(_SHUTDOWN_SECONDS)
         self._ended.set()
         shutil.rmtree(self._work, ignore_errors=True)
@@ -240,11 +215,8 @@ def main() -> None:
     settings = start()
     dispatcher = Dispatcher(settings, open_store(settings, patience=settings.start_seconds))
 
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        dispatcher.stop()
-
     for number in STOP_SIGNALS:
-        signal.signal(number, handle)
+        signal.signal(number, lambda number, frame: dispatcher.stop())
     dispatcher.run()
     logging.shutdown()
     os._exit(0)  # threads that wait for a hanging file store would be waited for

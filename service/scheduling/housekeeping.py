@@ -1,6 +1,6 @@
 """Agreement of files and database: periodic housekeeping by dispatchers, and the check and repair by `sgsst fsck`.
 
-Files of failed attempts are swept when their job ends. Orphaned files come from interrupted attempts that stored
+Files of failed attempts are swept once their job has ended. Orphaned files come from interrupted attempts that stored
 another file after the job had already ended elsewhere, and from processes that died. Both are safe while the service is
 running.
 """
@@ -10,28 +10,28 @@ from __future__ import annotations
 import secrets
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
-from sqlalchemy import ColumnElement, Select, and_, delete, exists, select, tuple_
+from sqlalchemy import ColumnElement, Select, and_, delete, exists, false, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute
 
 from service.files.blobs import Blobs, open_blobs
 from service.files.objects import Artifacts, ObjectStore
 from service.inputs import CHECKPOINT
 from service.problems import NotFoundError
-from service.scheduling.publishing import sweep
+from service.scheduling.attempt_files import sweep
 from service.settings import ServiceSettings
 from service.states import UNFINISHED
 from service.store import Store
 from service.store.files import BLOBS, UPLOADS
-from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadRow
+from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, UploadRow
 
 #: Interval between searches for orphaned files, in seconds.
 _SEARCH_SECONDS = 3600.0
-#: Maximum number of jobs whose leftover files are removed per round.
+#: Maximum number of jobs whose leftover files are looked for at a time.
 _MAX_SWEEPS = 20
 #: Description of a file.
 What = Literal["input", "result", "checkpoint", "upload"]
@@ -46,16 +46,16 @@ class Housekeeper:
 
     def clean_up(self) -> None:
         """Delete what has expired, and from time to time orphaned files."""
-        for job_id in self._store.retention.expire():
+        for job_id in self._store.jobs.expire():
             self._artifacts.objects.remove_below(job_id)
-        for job_id, epoch in self._store.retention.unswept(_MAX_SWEEPS):
-            sweep(self._store, self._artifacts, job_id, epoch)
+        while ended := self._store.jobs.unswept(_MAX_SWEEPS):
+            for job_id, epoch in ended:
+                sweep(self._store, self._artifacts, job_id, epoch)
         self._blobs.collect()
         if time.monotonic() - self._searched_at > _SEARCH_SECONDS:
             self._searched_at = time.monotonic()
             for objects, _, name in orphans(self._store, self._artifacts, self._blobs):
                 objects.remove(name)
-            self._blobs.objects.abort_old_parts()
 
 
 def orphans(store: Store, artifacts: Artifacts, blobs: Blobs) -> Iterator[tuple[ObjectStore, What, str]]:
@@ -121,17 +121,27 @@ class _File:
     """File that a row refers to.
 
     Attributes:
+        table: Table of the row.
         row: Condition for the row as long as it refers to the file.
-        forget: Callback that deletes the row if possible and returns what happened.
+        size: Minimum size in bytes.
+        sha256: Expected SHA-256; None for the bytes of an unfinished upload, which have none.
+        holder: Job or upload of the row; empty for an input, which any number of them may hold.
     """
 
     what: What
     objects: ObjectStore
     name: str
+    table: type[Base]
     row: ColumnElement[bool]
-    fault: Callable[[], Literal["missing", "damaged"] | None]
-    forget: Callable[[], str]
-    holders: Callable[[], tuple[str, ...]]
+    size: int
+    sha256: str | None = None
+    holder: str = ""
+
+    def fault(self) -> Literal["missing", "damaged"] | None:
+        """Read the file, and return its fault; None if it is intact."""
+        if self.sha256 is not None:
+            return self.objects.fault(self.name, self.sha256)
+        return None if self.objects.size(self.name) >= self.size else "missing"
 
 
 class FileCheck:
@@ -168,7 +178,7 @@ class FileCheck:
         kind = file.fault() and self._is_current(file) and file.fault()
         if not kind:
             return None
-        finding = Fault(kind, file.what, file.name, file.holders())
+        finding = Fault(kind, file.what, file.name, self._holders(file))
         if not mend:
             return finding
         done = ""
@@ -176,11 +186,25 @@ class FileCheck:
             target = f"{QUARANTINE}/{file.name.replace('/', '_')}-{secrets.token_hex(3)}"
             file.objects.move(file.name, target)
             done = f"moved to {target}; "
-        return replace(finding, mended=done + file.forget())
+        return replace(finding, mended=done + self._forget(file))
 
     def _is_current(self, file: _File) -> bool:
         with self._database.reading() as session:
             return bool(session.scalar(select(exists().where(file.row))))
+
+    def _holders(self, file: _File) -> tuple[str, ...]:
+        if file.holder:
+            return (file.holder,)
+        query = select(BlobUseRow.holder).where(BlobUseRow.sha256 == file.sha256).order_by(BlobUseRow.holder)
+        with self._database.reading() as session:
+            return tuple(session.scalars(query))
+
+    def _forget(self, file: _File) -> str:
+        """Delete the row of a lost file, unless it is an input that somebody holds, and return what happened."""
+        held = exists().where(BlobUseRow.sha256 == file.sha256) if file.table is BlobRow else false()
+        with self._database.writing() as session:
+            deleted = session.execute(delete(file.table).where(file.row, ~held))
+            return "its row is deleted" if deleted.rowcount else "it comes back when it is sent again"  # type: ignore[attr-defined]
 
     # --- files that rows refer to ----------------------------------------------------------------------------------
 
@@ -206,60 +230,20 @@ class FileCheck:
             return session.scalars(query).all()
 
     def _input(self, row: BlobRow) -> _File:
-        name = f"{BLOBS}/{row.location}"
         same = and_(BlobRow.sha256 == row.sha256, BlobRow.location == row.location)
-
-        def holders() -> tuple[str, ...]:
-            with self._database.reading() as session:
-                query = select(BlobUseRow.holder).where(BlobUseRow.sha256 == row.sha256).order_by(BlobUseRow.holder)
-                return tuple(session.scalars(query))
-
-        def forget() -> str:
-            used = exists().where(BlobUseRow.sha256 == row.sha256)
-            with self._database.writing() as session:
-                deleted = session.execute(delete(BlobRow).where(same, ~used))
-                return "its row is deleted" if deleted.rowcount else "it comes back when it is sent again"  # type: ignore[attr-defined]
-
-        return _File("input", self._objects, name, same, lambda: self._objects.fault(name, row.sha256), forget, holders)
+        return _File("input", self._objects, f"{BLOBS}/{row.location}", BlobRow, same, row.size, row.sha256)
 
     def _result(self, row: ArtifactRow) -> _File:
-        objects = self._artifacts.objects
+        what: What = "checkpoint" if row.name == CHECKPOINT else "result"
+        objects, holder = self._artifacts.objects, f"job:{row.job_id}"
         named = and_(ArtifactRow.job_id == row.job_id, ArtifactRow.name == row.name)
         same = and_(named, ArtifactRow.location == row.location)
-
-        def forget() -> str:
-            with self._database.writing() as session:
-                session.execute(delete(ArtifactRow).where(same))
-            return "its row is deleted"
-
-        return _File(
-            "checkpoint" if row.name == CHECKPOINT else "result",
-            objects,
-            row.location,
-            same,
-            lambda: objects.fault(row.location, row.sha256),
-            forget,
-            lambda: (f"job:{row.job_id}",),
-        )
+        return _File(what, objects, row.location, ArtifactRow, same, row.size, row.sha256, holder)
 
     def _parts(self, row: UploadRow) -> list[_File]:
         """Return the files that hold the bytes of an unfinished upload."""
-
-        def forget() -> str:
-            self._store.inputs.delete_upload(row.id, row.owner)
-            return "the upload is deleted"
-
-        def part(name: str, size: int) -> _File:
-            return _File(
-                "upload",
-                self._objects,
-                name,
-                and_(UploadRow.id == row.id, UploadRow.sha256.is_(None)),
-                lambda: None if self._objects.size(name) >= size else "missing",
-                forget,
-                lambda: (f"upload:{row.id}",),
-            )
-
-        if self._objects.local:
-            return [part(f"{UPLOADS}/{row.id}.part", row.offset)]
-        return [part(each.location, each.size) for each in self._store.inputs.parts(row.id)]
+        parts = [(f"{UPLOADS}/{row.id}.part", row.offset)]
+        if not self._objects.local:
+            parts = [(each.location, each.size) for each in self._store.inputs.parts(row.id)]
+        same, holder = and_(UploadRow.id == row.id, UploadRow.sha256.is_(None)), f"upload:{row.id}"
+        return [_File("upload", self._objects, name, UploadRow, same, size, holder=holder) for name, size in parts]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import re
 import signal
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -15,13 +16,21 @@ from pydantic import BaseModel
 from service.inputs import CHECKPOINT
 from service.problems import DatabaseUnavailableError, NoSpaceError, StoreError
 from service.states import AttemptOutcome, Cause, Published
-from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
+from sgsst_core.errors import (
+    DivergedError,
+    InfrastructureError,
+    InvalidInputError,
+    OutputError,
+    SgsstError,
+    WeightsError,
+    is_out_of_memory,
+)
 from sgsst_core.progress import Progress
 from worker.job import JobSpec, Result, scene_bytes
 from worker.run import Stored
 
 if TYPE_CHECKING:
-    from service.scheduling.rank_folder import RankFolder
+    from service.scheduling.attempt_files import RankFolder
 
 
 @dataclass(frozen=True)
@@ -58,7 +67,7 @@ class StoreWorkplace:
         Raises:
             InfrastructureError: If the store is unreachable or has lost a file, or the disk is full.
         """
-        from service.scheduling.rank_folder import RankFolder
+        from service.scheduling.attempt_files import RankFolder
 
         try:
             return RankFolder(self, rank, stored)
@@ -72,7 +81,7 @@ class StoreWorkplace:
 
     def tidy(self) -> None:
         """Remove folders of dead ranks on this machine."""
-        from service.scheduling.rank_folder import remove_leftovers
+        from service.scheduling.attempt_files import remove_leftovers
 
         remove_leftovers()
 
@@ -162,6 +171,19 @@ class Ending:
     detail: str | None = None
 
 
+def failure(error: Exception) -> Ending:
+    """Return the ending for an error; the error is permanent if a retry would fail in the same way."""
+    cause = cause_of_error(error)
+    if cause != Cause.JOB:
+        detail = "".join(traceback.format_exception(error))
+        return Ending(AttemptOutcome.FAILED, error=outage(cause), detail=detail)
+    code, message = "internal", f"{type(error).__name__}: {error}"
+    if isinstance(error, SgsstError) or is_out_of_memory(error):
+        code, message = error.code if isinstance(error, SgsstError) else "out-of-memory", str(error)
+    permanent = isinstance(error, InvalidInputError | DivergedError)
+    return Ending(AttemptOutcome.FAILED, error={"code": code, "message": message}, permanent=permanent)
+
+
 class Report(BaseModel):
     """Report of an attempt's process to its dispatcher, a line of JSON; one of its fields is set.
 
@@ -181,7 +203,7 @@ def attempt_ending(
     request: StopRequest | None,
     reported: Ending | None,
     exit_code: int,
-    log_tail: str | None,
+    log_tail: str,
     *,
     has_result: bool,
     cluster: bool = False,
@@ -192,7 +214,7 @@ def attempt_ending(
         request: CANCEL or RELEASE if the end was requested, possibly too late; None otherwise.
         reported: Ending that the process has reported; None if it was interrupted or died.
         exit_code: Exit code of the process; negative for the signal that killed it.
-        log_tail: Last part of the process' log; None if there is no log.
+        log_tail: Last part of the process' log.
         has_result: Whether the stylized scene exists.
         cluster: Whether the process only supervises ranks on a Ray cluster. Ray terminates it with an exit code and
             without a report if the cluster's head or the machine's own node dies; that counts as an outage.
@@ -217,7 +239,7 @@ def attempt_ending(
     return Ending(AttemptOutcome.FAILED, error=crash)
 
 
-def _crash_error(exit_code: int, log_tail: str | None) -> dict[str, Any]:
+def _crash_error(exit_code: int, log_tail: str) -> dict[str, Any]:
     """Return the error of a process that ended without a report."""
     if exit_code == -signal.SIGKILL:
         message = "The process that ran the job was killed; the machine may have run out of memory."
@@ -225,5 +247,4 @@ def _crash_error(exit_code: int, log_tail: str | None) -> dict[str, Any]:
         message = f"The process that ran the job was ended by {signal.Signals(-exit_code).name}."
     else:
         message = f"The process that ran the job ended with code {exit_code}."
-    error = {"code": "crashed", "message": message}
-    return error if log_tail is None else {**error, "log": log_tail}
+    return {"code": "crashed", "message": message, "log": log_tail}

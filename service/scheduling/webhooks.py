@@ -21,7 +21,7 @@ from service.outgoing import parse_url, send
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import PROGRESS_MESSAGE
-from service.store.operations import Delivery
+from service.store.tables import DeliveryRow
 
 #: Delays before further attempts in seconds: the schedule that Standard Webhooks suggests, up to a day.
 _RETRY_SECONDS = (5.0, 300.0, 1800.0, 7200.0, 18_000.0, 36_000.0)
@@ -76,19 +76,19 @@ class Deliverer:
         asyncio.run(self._deliver_due())
 
     async def _deliver_due(self) -> None:
-        sending: dict[asyncio.Task[None], Delivery] = {}
+        sending: dict[asyncio.Task[None], tuple[DeliveryRow, str]] = {}
         while True:
             limits = {"total": _MAX_TOTAL, "per_owner": _MAX_PER_OWNER, "per_url": _MAX_PER_URL}
             due = self._store.operations.due_deliveries
-            for delivery in await asyncio.to_thread(due, _HOLD_SECONDS, list(sending.values()), **limits):
-                sending[asyncio.create_task(self._deliver(delivery))] = delivery
+            for claimed in await asyncio.to_thread(due, _HOLD_SECONDS, list(sending.values()), **limits):
+                sending[asyncio.create_task(self._deliver(claimed[0]))] = claimed
             if not sending:
                 return
             done, _ = await asyncio.wait(sending, timeout=_ROUND_SECONDS, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 del sending[task]
 
-    async def _deliver(self, delivery: Delivery) -> None:
+    async def _deliver(self, delivery: DeliveryRow) -> None:
         """Send one message and record the outcome; errors do not affect other messages."""
         try:
             async with asyncio.timeout(_DEADLINE):
@@ -104,12 +104,10 @@ class Deliverer:
             _log.warning(
                 "webhook failed, %s: try=%d error=%s", outcome, delivery.tries, error, extra={"job": delivery.job_id}
             )
-        try:
-            await asyncio.to_thread(self._store.operations.settle_delivery, delivery.id, wait)
-        except Exception:  # due again when the hold expires
-            _log.exception("webhook outcome not stored", extra={"job": delivery.job_id})
+        # if this fails, asyncio logs the error, and the message is due again when the hold expires
+        await asyncio.to_thread(self._store.operations.settle_delivery, delivery.id, wait)
 
-    async def _send(self, delivery: Delivery) -> str | None:
+    async def _send(self, delivery: DeliveryRow) -> str | None:
         """Send one message and return the error; None for success."""
         url = parse_url(delivery.url)
         body = json.dumps(delivery.body, separators=(",", ":")).encode()

@@ -8,8 +8,10 @@ from service.store.database import ANSWER_SECONDS, Clock, Database
 from service.store.files import InputRows
 from service.store.jobs import Jobs, ShareLinks
 from service.store.keys import Keys, Sessions
-from service.store.operations import Operations, Retention
-from service.store.queue import Leases, RetryPolicy
+from service.store.queue import Leases, Operations, RetryPolicy
+
+#: Seconds of a day.
+_DAY = 86_400.0
 
 
 class Store:
@@ -19,13 +21,13 @@ class Store:
         self, settings: ServiceSettings, clock: Clock | None = None, answer_seconds: float = ANSWER_SECONDS
     ) -> None:
         self.database = Database(settings.database_url, clock, answer_seconds)
-        self.jobs = Jobs(self.database, settings.retention_seconds)
+        retention = settings.retention_days * _DAY
+        self.jobs = Jobs(self.database, retention)
         policy = RetryPolicy(settings.max_attempts, settings.retry_seconds)
-        self.leases = Leases(self.database, settings.lease_seconds, policy, settings.retention_seconds)
-        self.retention = Retention(self.database, settings.retention_seconds)
+        self.leases = Leases(self.database, settings.lease_seconds, policy, retention)
         self.inputs = InputRows(self.database)
         self.keys = Keys(self.database)
-        self.sessions = Sessions(self.database, settings.session_seconds)
+        self.sessions = Sessions(self.database, settings.session_days * _DAY)
         self.shares = ShareLinks(self.database)
         self.operations = Operations(self.database, settings.lease_seconds)
 

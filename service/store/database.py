@@ -24,7 +24,6 @@ from sqlalchemy.orm import Session
 from service import problems
 from service.problems import DatabaseUnavailableError, ServiceError
 from service.store.tables import Base, CounterRow, IdempotencyRow
-from sgsst_core.errors import SettingsError
 
 #: Time in seconds that a transaction waits for a probing transaction before it is rejected.
 _PROBE_SECONDS = 0.2
@@ -48,11 +47,14 @@ class Gate:
     After a transaction failed because of an outage, one transaction at a time probes the database, and all others are
     rejected almost immediately. Otherwise every thread of a process would wait for its own timeout, and none would be
     left for requests that need no database.
+
+    Args:
+        seconds: Time in seconds that a transaction waits for the one before it; None if any number may run at once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, seconds: float | None = None) -> None:
         self._refusal: DatabaseUnavailableError | None = None
-        self._probe = threading.Lock()
+        self._turn, self._seconds = threading.Lock(), seconds
 
     @contextmanager
     def guarded(self) -> Iterator[None]:
@@ -62,24 +64,22 @@ class Gate:
             DatabaseUnavailableError: If the database does not respond, or an earlier outage continues.
         """
         refusal = self._refusal
-        if refusal is not None and not self._probe.acquire(timeout=_PROBE_SECONDS):
-            raise refusal.problem()
+        patience = self._seconds if refusal is None else _PROBE_SECONDS
+        if patience is not None and not self._turn.acquire(timeout=patience):
+            raise problems.DATABASE_BUSY() if refusal is None else refusal.problem()
+        failure = None
         try:
             with translated():
                 yield
         except DatabaseUnavailableError as error:
             if refusal is None:
                 _log.warning("database unavailable: %s", getattr(error.__cause__, "orig", error))  # without the SQL
-            self._refusal = error
+            failure = error
             raise
-        except BaseException:
-            self._refusal = None
-            raise
-        else:
-            self._refusal = None
         finally:
-            if refusal is not None:
-                self._probe.release()
+            self._refusal = failure
+            if patience is not None:
+                self._turn.release()
 
 
 @contextmanager
@@ -141,8 +141,6 @@ Clock = Callable[[], float]
 
 #: Version of the newest migration; a database with this version is opened without loading the migrations.
 SCHEMA = "0013"
-#: Version of the first migration; databases of earlier development versions cannot be migrated.
-_FIRST = "0010"
 MIGRATIONS = Path(__file__).with_name("migrations")
 #: Default timeout in seconds of each wait of a transaction: for the write lock, a connection, and each response.
 ANSWER_SECONDS = 30.0
@@ -188,16 +186,14 @@ class Database:
         self._offset, self._asked_at = 0.0, -math.inf
         if self.sqlite and self.url.database:
             Path(self.url.database).parent.mkdir(parents=True, exist_ok=True)
-        self._answer_seconds = answer_seconds
         self.engine = self._make_engine(answer_seconds, pool_size=20, max_overflow=30)
         self._writer = self.engine.execution_options(sgsst_writes=True)
         # PostgreSQL's default gives each statement a snapshot of its own
         one_snapshot = {} if self.sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
         self._reader = self.engine.execution_options(**one_snapshot)
         self._reserved = self._make_engine(_RESERVED_SECONDS, pool_size=2, max_overflow=0)
-        # SQLite's writers wait for each other by polling; a lock avoids that within one process
-        self._write_lock = threading.Lock() if self.sqlite else None
-        self._reads, self._writes = Gate(), Gate()
+        # SQLite's writers wait for each other by polling; taking turns avoids that within one process
+        self._reads, self._writes = Gate(), Gate(answer_seconds if self.sqlite else None)
 
     def _make_engine(self, seconds: float | None, **pool: int) -> Engine:
         """Return an engine with this timeout for transactions in seconds; None for no limit (SQLite always has one)."""
@@ -220,24 +216,10 @@ class Database:
         """Provide a transaction that is committed at the end of the block; on SQLite it is the only writer."""
         with (
             self._writes.guarded(),
-            self._locked_for_writing(),
             Session(self._writer, expire_on_commit=False) as session,
             session.begin(),
         ):
             yield session
-
-    @contextmanager
-    def _locked_for_writing(self) -> Iterator[None]:
-        """Hold this process' write lock if the database is SQLite."""
-        if self._write_lock is None:
-            yield
-            return
-        if not self._write_lock.acquire(timeout=self._answer_seconds):
-            raise problems.DATABASE_BUSY()
-        try:
-            yield
-        finally:
-            self._write_lock.release()
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
@@ -277,17 +259,9 @@ class Database:
 
         Tables of a later version are used as they are. Later migrations only add to the schema, so processes of this
         version keep working, and can be restarted, while they are replaced one by one.
-
-        Raises:
-            SettingsError: If the tables are those of an earlier development version.
         """
         if self.is_up_to_date():
             return
-        if (version := self._version()) and version < _FIRST:
-            raise SettingsError(
-                f"{self.url}: is a database of an earlier development version ({version}), which cannot be migrated. "
-                "Use another data folder or database; the earlier version can still open this one."
-            )
         engine = self._make_engine(None)  # creating an index may take long
         try:
             with translated(), self._upgrading(engine):
@@ -335,12 +309,9 @@ class Database:
         elif self.sqlite:
             yield
         else:
-            with engine.connect() as connection:
-                connection.execute(text("SELECT pg_advisory_lock(:lock)"), {"lock": _LOCK})
-                try:
-                    yield
-                finally:
-                    connection.execute(text("SELECT pg_advisory_unlock(:lock)"), {"lock": _LOCK})
+            with engine.begin() as connection:
+                connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
+                yield
 
 
 def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, seconds: float) -> Any:

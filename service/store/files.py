@@ -19,8 +19,6 @@ from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, Uploa
 BLOBS, UPLOADS = "blobs", "uploads"
 #: Lifetime of an unreferenced blob in seconds: the request that uploaded it may not have created its job yet.
 GRACE_SECONDS = 3600.0
-#: Fraction of `GRACE_SECONDS` within which a blob's `touched_at` is not updated again, which saves writes.
-_HOLD_FRACTION = 0.1
 #: Maximum number of unfinished uploads per key.
 MAX_OPEN_UPLOADS = 1000
 #: Lifetime of an input's inspection result in seconds.
@@ -74,16 +72,12 @@ class InputRows:
         Raises:
             NotFoundError: If a blob is gone.
         """
+        with self.database.writing() as session:
+            held = BlobRow.sha256.in_(digests)
+            # the same lock order as in `release_blobs`
+            session.execute(select(BlobRow.sha256).where(held).order_by(BlobRow.sha256).with_for_update())
+            session.execute(update(BlobRow).where(held).values(touched_at=self.database.clock()))
         blobs = self.blobs(digests)
-        # `touched_at` is not updated if it is recent, so consecutive submissions of one scene need no write
-        recent = self.database.clock() - _HOLD_FRACTION * GRACE_SECONDS
-        if any(sha256 not in blobs or blobs[sha256].touched_at < recent for sha256 in digests):
-            with self.database.writing() as session:
-                held = BlobRow.sha256.in_(digests)
-                # the same lock order as in `release_blobs`
-                session.execute(select(BlobRow.sha256).where(held).order_by(BlobRow.sha256).with_for_update())
-                session.execute(update(BlobRow).where(held).values(touched_at=self.database.clock()))
-            blobs = self.blobs(digests)
         missing = next((sha256 for sha256 in digests if sha256 not in blobs), None)
         if missing is not None:
             raise problems.NOT_FOUND(f"There is no file with SHA-256 {missing}.")

@@ -1,4 +1,4 @@
-"""Jobs of users: create, list, rename, finish, cancel, retry, delete; their inputs, files, events, history and shares.
+"""Jobs of users, from creation to expiry, with their inputs, files, events, history and shares.
 
 Changes that dispatchers make too are functions that run within the caller's transaction. Every transaction takes its
 locks in one order, so that no two wait for each other: the owner's limits, uploads by id, jobs by id, then the rows of
@@ -32,6 +32,7 @@ from sqlalchemy import (
     select,
     text,
     tuple_,
+    update,
 )
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
@@ -40,6 +41,7 @@ from service import problems
 from service.states import (
     ACTIONS,
     ENDED,
+    FINISHED,
     UNFINISHED,
     JobStatus,
     Published,
@@ -48,15 +50,18 @@ from service.states import (
     allowed,
     next_status,
 )
-from service.store.database import Database, count, idempotency_row, new_id, upsert
+from service.store.database import IDEMPOTENCY_SECONDS, Database, count, idempotency_row, new_id, upsert
 from service.store.files import close_receipt, release_blobs
 from service.store.keys import NO_QUOTAS, Quotas, add_usage, check_bytes, count_job, digest, lock_owner
 from service.store.tables import (
     ArtifactRow,
     AttemptRow,
     Base,
+    BlobUseRow,
     DeliveryRow,
+    DispatcherRow,
     EventRow,
+    IdempotencyRow,
     JobRow,
     KeyRow,
     ProgressPointRow,
@@ -104,14 +109,13 @@ def end(session: Session, job: JobRow, transition: Transition, now: float, reten
     Args:
         retention: Most seconds until its results expire; see `retention_of`.
     """
-    status = next_status(job.status, transition)
     job.finished_at, job.expires_at = now, now + retention_of(job, retention)
     job.lease_owner = job.lease_expires_at = None
     move(session, job, transition, now)
-    count(session, "sgsst_jobs_finished_total", f'status="{status}"')
+    count(session, "sgsst_jobs_finished_total", f'status="{job.status}"')
     for waiting in session.scalars(_WAITING_PROGRESS, {"job_id": job.id}) if job.webhook_events else ():
         session.delete(waiting)
-    send_webhook(session, job, "completed", status, now)
+    send_webhook(session, job, "completed", job.status, now)
 
 
 def retention_of(job: JobRow, most: float) -> float:
@@ -152,6 +156,17 @@ def add_status_event(session: Session, job: JobRow, now: float) -> None:
 def add_event(session: Session, job_id: str, kind: str, data: dict[str, Any], now: float) -> None:
     """Add an event to a job."""
     session.execute(insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
+
+
+def put_artifact(session: Session, job_id: str, file: Published, now: float) -> list[str]:
+    """Write the row of a job's file; return the location of the file of the same name that it replaces, if any."""
+    row = session.get(ArtifactRow, (job_id, file.name))
+    replaced = [row.location] if row is not None and row.location != file.location else []
+    if row is None:
+        row = ArtifactRow(job_id=job_id, name=file.name)
+        session.add(row)
+    row.location, row.size, row.sha256, row.created_at = file.location, file.size, file.sha256, now
+    return replaced
 
 
 def holder_name(job_id: str) -> str:
@@ -236,19 +251,13 @@ def _counts_and_named(
     """Return the number of files by role of each job, and its entries of scene, style images and camera files."""
     counts: dict[str, dict[str, int]] = {job_id: {} for job_id in job_ids}
     named: dict[str, list[dict[str, Any]]] = {job_id: [] for job_id in job_ids}
-    if job_ids:
-        of_jobs = {"ids": list(job_ids)}
-        for job_id, role, number in connection.execute(_input_query(connection, "counts"), of_jobs):
+    if job_ids:  # PostgreSQL compares with no type in an empty list
+        of_jobs, queries = {"ids": list(job_ids)}, _queries(connection.dialect.name)
+        for job_id, role, number in connection.execute(queries["counts"], of_jobs):
             counts[job_id][role] = number
-        for job_id, entry in connection.execute(
-            _input_query(connection, "named"), {**of_jobs, "roles": list(_NAMED_ROLES)}
-        ):
+        for job_id, entry in connection.execute(queries["named"], {**of_jobs, "roles": list(_NAMED_ROLES)}):
             named[job_id].append(json.loads(entry))
     return counts, named
-
-
-def _input_query(connection: Connection, name: str) -> TextClause:
-    return _queries(connection.dialect.name)[name]
 
 
 @cache
@@ -297,6 +306,8 @@ _EARLIER = _QUEUED.where(
 _AHEAD = select(_HIGHER.scalar_subquery() + _EARLIER.scalar_subquery())
 
 
+#: Time in seconds after which a dispatcher without heartbeat is forgotten.
+_FORGET_SECONDS = 86_400.0
 #: Maximum number of shares of a job that have not expired.
 MOST_SHARES = 20
 _TOKEN = re.compile(r"(shr_[0-9a-f]{20,36})\.[A-Za-z0-9_-]{43}", re.ASCII)
@@ -396,10 +407,9 @@ class Jobs:
             used_key = None
             if idempotency is not None:
                 used_key = idempotency_row(session, new.owner, idempotency.key, idempotency.fingerprint, now)
-            if used_key is not None and used_key.created_id:
-                known = session.get(JobRow, used_key.created_id)
-                if known is not None:
-                    return known, False
+            known = session.get(JobRow, used_key.created_id) if used_key and used_key.created_id else None
+            if known is not None:
+                return known, False
             _check_queue(session, new.owner, limit)
             count_job(session, new.owner, quotas, now, sum(entry["size"] for entry in new.inputs))
             values = new.row(now)
@@ -437,14 +447,14 @@ class Jobs:
         """Return a job's inputs from a position on, each with its index among those of its role."""
         with self._database.reading_rows() as connection:
             parameters = {"ids": [job_id], "start": start, "most": limit}
-            rows = connection.execute(_input_query(connection, "page"), parameters)
+            rows = connection.execute(_queries(connection.dialect.name)["page"], parameters)
             return [(index, json.loads(entry)) for index, entry in rows]
 
     def input(self, job_id: str, role: str, index: int) -> dict[str, Any] | None:
         """Return an input of a job by its role and its index among those of the role; None if there is none."""
         with self._database.reading_rows() as connection:
             parameters = {"ids": [job_id], "roles": [role], "index": index}
-            entry = connection.execute(_input_query(connection, "one"), parameters).scalar()
+            entry = connection.execute(_queries(connection.dialect.name)["one"], parameters).scalar()
             return None if entry is None else dict(json.loads(entry))
 
     def detail(self, job_id: str, owner: str | None) -> tuple[ShownJob, list[AttemptRow]]:
@@ -566,9 +576,7 @@ class Jobs:
             if job.status != JobStatus.SUCCEEDED:
                 raise problems.NO_RESULT(job_status=job.status)
             job.viewpoints = viewpoints
-            locations = list(session.scalars(select(ArtifactRow.location).where(files)))
-            session.execute(delete(ArtifactRow).where(files))
-        return locations
+            return list(session.scalars(delete(ArtifactRow).where(files).returning(ArtifactRow.location)))
 
     def delete(self, job_id: str, owner: str | None) -> list[str]:
         """Delete an ended job and release its inputs; the caller removes its results afterwards.
@@ -603,19 +611,14 @@ class Jobs:
         files: Sequence[Published],
         owner: str,
         quotas: Quotas = NO_QUOTAS,
-        *,
-        replace: bool = False,
-        receipt: str | None = None,
     ) -> list[str]:
-        """Publish files derived from `source`, unless `source` has been removed or replaced.
+        """Publish files derived from `source`, replacing those of the same names, unless `source` is gone.
 
         Args:
             source: Row of the file that they were derived from.
-            replace: Whether files replace those of the same names, instead of being left out.
-            receipt: Receipt that the owner was charged by before the files were stored; the files take it over.
 
         Returns:
-            Locations of files without a row: replaced ones, and those that were left out or whose `source` is gone.
+            Locations of files without a row: replaced ones, and those whose `source` is gone or replaced.
 
         Raises:
             QUOTA_EXCEEDED: If the files exceed the owner's quota of stored bytes; none is published.
@@ -626,20 +629,12 @@ class Jobs:
             session.get(JobRow, source.job_id, with_for_update=True)  # before its files, as everybody else
             row = session.get(ArtifactRow, (source.job_id, source.name))
             for file in files:
-                existing = session.get(ArtifactRow, (source.job_id, file.name))
-                if row is None or row.location != source.location or (existing is not None and not replace):
+                if row is None or row.location != source.location:
                     unused.append(file.location)
                     continue
-                if existing is not None:
-                    unused.append(existing.location)
-                    session.delete(existing)
-                    session.flush()
-                values = {"name": file.name, "location": file.location, "size": file.size, "sha256": file.sha256}
                 now = self._database.clock()
-                session.add(ArtifactRow(job_id=source.job_id, created_at=now, **values))
+                unused += put_artifact(session, source.job_id, file, now)
                 add_usage(session, owner, now, bytes=file.size)
-            if receipt is not None:
-                close_receipt(session, receipt)
             session.flush()
             check_bytes(session, owner, quotas)
         return unused
@@ -660,6 +655,43 @@ class Jobs:
         query = select(EventRow.job_id, func.max(EventRow.id)).where(EventRow.job_id.in_(job_ids))
         with self._database.reading() as session:
             return dict(session.execute(query.group_by(EventRow.job_id)).all())
+
+    # --- housekeeping, which any dispatcher may do -------------------------------------------------------------------
+
+    def expire(self) -> list[str]:
+        """Expire old results, and delete the records of jobs that expired as long ago.
+
+        Returns:
+            Ids of jobs whose files are to be removed.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            old = select(JobRow).where(JobRow.expires_at < now).order_by(JobRow.id).limit(100)
+            due = session.scalars(old.with_for_update(skip_locked=True)).all()
+            for job in due:
+                if job.status == JobStatus.EXPIRED:
+                    forget(session, job)
+                    continue
+                job.expires_at = now + retention_of(job, self._retention)
+                session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
+                # blobs without other holders are collected later
+                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))
+                move(session, job, Transition.EXPIRE, now)
+            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
+            session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
+            return [job.id for job in due]
+
+    def unswept(self, limit: int) -> list[tuple[str, int]]:
+        """Return ended jobs that may have files without database rows, each with the epoch of its last lease."""
+        query = select(JobRow.id, JobRow.lease_epoch).where(JobRow.swept.is_(False), JobRow.status.in_(FINISHED))
+        with self._database.reading() as session:
+            return [(job_id, epoch) for job_id, epoch in session.execute(query.limit(limit))]
+
+    def mark_swept(self, job_id: str, epoch: int) -> None:
+        """Mark a job as having no files without rows, unless it has been queued again."""
+        same = and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(FINISHED))
+        with self._database.writing() as session:
+            session.execute(update(JobRow).where(same).values(swept=True))
 
 
 def _check_queue(session: Session, owner: str, limit: int) -> None:
@@ -742,10 +774,9 @@ class ShareLinks:
             NoShareError: If the job has no such share.
         """
         with self._database.writing() as session:
-            row = session.get(ShareRow, share_id, with_for_update=True)
-            if row is None or row.job_id != job_id:
+            deleted = session.execute(delete(ShareRow).where(ShareRow.id == share_id, ShareRow.job_id == job_id))
+            if not deleted.rowcount:  # type: ignore[attr-defined]
                 raise problems.NO_SHARE()
-            session.delete(row)
 
     def find(self, token: str) -> Shared:
         """Return the share with this token, and its job.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import date, timedelta
 from typing import Any, Self
 
@@ -57,9 +57,8 @@ class Quotas:
         )
 
     def with_own(self, own: Mapping[str, Any] | None) -> Self:
-        """Return these quotas overridden by a key's own; names from other versions of the service are ignored."""
-        known = {field.name for field in fields(self)}
-        return replace(self, **{name: value for name, value in (own or {}).items() if name in known})
+        """Return these quotas overridden by a key's own."""
+        return replace(self, **(own or {}))
 
     def given(self) -> dict[str, Any]:
         """Return the quotas that are not None by name, for `with_own`."""

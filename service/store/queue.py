@@ -1,4 +1,4 @@
-"""The queue: which job is next, leases of jobs by dispatchers, and the policy for repeating attempts.
+"""The queue: which job is next, leases of jobs by dispatchers, the policy for repeating attempts, and monitoring.
 
 A dispatcher holds a lease of each job that it runs. A lease lasts some seconds unless it is renewed. Each lease of a
 job has a number, its epoch. Every write of a dispatcher names the epoch that it holds, and raises `LeaseLostError`
@@ -14,7 +14,10 @@ store has ended is repeated until it succeeds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import base64
+import secrets
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -25,14 +28,17 @@ from sqlalchemy import (
     Float,
     Integer,
     Select,
+    SQLColumnExpression,
     String,
     and_,
     bindparam,
     case,
     delete,
     func,
+    literal,
     or_,
     select,
+    text,
     union_all,
     update,
 )
@@ -42,9 +48,20 @@ from service import problems
 from service.problems import ServiceError
 from service.states import ACTIVE, AttemptOutcome, Cause, JobStatus, Published, Transition
 from service.store.database import Database, count, observe, upsert
-from service.store.jobs import add_event, add_point, end, move, send_webhook
+from service.store.jobs import add_event, add_point, end, move, put_artifact, send_webhook
 from service.store.keys import add_usage
-from service.store.tables import ArtifactRow, AttemptRow, DispatcherRow, EventRow, JobRow, ProgressPointRow, TurnRow
+from service.store.tables import (
+    ArtifactRow,
+    AttemptRow,
+    CounterRow,
+    DeliveryRow,
+    DispatcherRow,
+    EventRow,
+    JobRow,
+    ProgressPointRow,
+    SecretRow,
+    TurnRow,
+)
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.progress import Progress
 from worker.job import CONTINUABLE
@@ -55,10 +72,6 @@ _MOST_CANDIDATES = 16
 # Queries are built once, because building one takes longer than running it.
 _NOW: BindParameter[float] = bindparam("now", type_=Float)
 _MOST: BindParameter[int] = bindparam("most", type_=Integer)
-
-
-def _count(condition: ColumnElement[bool]) -> Select[int]:
-    return select(func.count()).select_from(select(JobRow.id).where(condition).limit(_MOST).subquery())
 
 
 def _first_of_each_owner() -> Select[Any]:
@@ -78,11 +91,13 @@ def _first_of_each_owner() -> Select[Any]:
     return select(each.label("id")).where(owners.c.owner.is_not(None))
 
 
-#: Conditions for queued jobs that may start now, and for jobs with expired leases; queries that count them, up to
-#: `most`.
+#: Conditions for queued jobs that may start now, and for jobs with expired leases.
 _QUEUED = and_(JobRow.status == JobStatus.QUEUED, JobRow.not_before <= _NOW)
 _EXPIRED = and_(JobRow.lease_expires_at < _NOW, JobRow.status.in_(ACTIVE))
-_WAITING, _LOST = _count(_QUEUED), _count(_EXPIRED)
+#: Number of both, up to `most`.
+_WAITING = select(func.count()).select_from(
+    union_all(select(JobRow.id).where(_QUEUED), select(JobRow.id).where(_EXPIRED)).limit(_MOST).subquery()
+)
 #: Ids of the jobs that may be next.
 _CANDIDATES = union_all(_first_of_each_owner(), select(JobRow.id).where(_EXPIRED))
 #: First candidates in order. Their conditions are checked again, because rows may have changed.
@@ -131,23 +146,6 @@ def cause_of(error: Mapping[str, Any] | None) -> Cause:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Decision about a job.
-
-    Attributes:
-        transition: STOP, FAIL or REQUEUE.
-        failures: New number of consecutive failed attempts without progress.
-        failed_step: Last saved step at the time of the last failure; None for no step.
-        wait: Delay in seconds before the job may be taken again.
-    """
-
-    transition: Transition
-    failures: int
-    failed_step: int | None
-    wait: float = 0.0
-
-
-@dataclass(frozen=True)
 class RetryPolicy:
     """Policy for retrying jobs.
 
@@ -167,32 +165,34 @@ class RetryPolicy:
         causes: Sequence[Cause] = (Cause.JOB,),
         *,
         permanent: bool = False,
-    ) -> Verdict:
-        """Decide whether a job is retried after an attempt that failed, was lost or was released.
+    ) -> tuple[Transition, float]:
+        """Decide what follows an attempt that failed, was lost or was released, and count its failure in the job.
 
         Args:
-            job: Job with the status and the count of failures from before the decision.
+            job: Job with its status from before the decision.
             causes: Cause of the attempt's end, then those of earlier attempts back to the last one that made a step.
             permanent: Whether another attempt would fail in the same way.
+
+        Returns:
+            STOP, FAIL or REQUEUE, and the delay in seconds before a queued job may be taken again.
         """
-        failures, failed_step = job.failures, job.failed_step
         if job.status == JobStatus.CANCELING:
-            return Verdict(Transition.STOP, failures, failed_step)
+            return Transition.STOP, 0.0
         if outcome == AttemptOutcome.RELEASED:
-            return Verdict(Transition.REQUEUE, failures, failed_step)
+            return Transition.REQUEUE, 0.0
         if causes[0] == Cause.JOB:
             # progress resets the count: a long job survives many sporadic failures, but not one at the same step again
-            progress = (job.saved_step or 0) > (failed_step or 0)
-            failures, failed_step = 0 if progress else failures + 1, job.saved_step
-            failed, repeated = permanent or failures >= self.max_attempts, failures
+            progress = (job.saved_step or 0) > (job.failed_step or 0)
+            job.failures, job.failed_step = 0 if progress else job.failures + 1, job.saved_step
+            failed, repeated = permanent or job.failures >= self.max_attempts, job.failures
         else:
             failed = list(causes[:MAX_LOSSES]) == [Cause.DISPATCHER] * MAX_LOSSES
             repeated = next((number for number, cause in enumerate(causes) if cause == Cause.JOB), len(causes))
         if failed:
-            return Verdict(Transition.FAIL, failures, failed_step)
+            return Transition.FAIL, 0.0
         wait = min(self.retry_seconds * 2.0 ** max(repeated - 1, 0), MAX_RETRY_SECONDS)
         # a lost attempt has already cost the duration of a lease
-        return Verdict(Transition.REQUEUE, failures, failed_step, 0.0 if outcome == AttemptOutcome.LOST else wait)
+        return Transition.REQUEUE, 0.0 if outcome == AttemptOutcome.LOST else wait
 
 
 #: Expiry of a lease whose dispatcher is known to be dead.
@@ -251,8 +251,8 @@ class Leases:
     def take(self, dispatcher: str, fits: Callable[[JobRow], bool] = lambda job: True) -> Lease | None:
         """Take the next job: by highest priority, then the owner who has waited longest, then the oldest job.
 
-        Jobs with expired leases are candidates like queued ones. If such a job has used up its attempts, it is ended as
-        failed, and if it was being canceled, as canceled; then the next job is tried.
+        Jobs with expired leases are candidates: they are queued again first. If such a job has used up its attempts, it
+        is ended as failed, and if it was being canceled, as canceled; then the next job is tried.
 
         Jobs of other owners overtake a job that does not fit, but only until it has waited for `OVERTAKEN_SECONDS`.
         Then nothing is taken until it fits here or another dispatcher takes it.
@@ -263,25 +263,19 @@ class Leases:
         now = self._database.clock()
         with self._database.writing() as session:
             for job in _next_jobs(session, now):
-                lost = job.status in ACTIVE
-                if lost and self._close_lost(session, job, dispatcher, now):
+                if job.status in ACTIVE and self._close_lost(session, job, dispatcher, now) != Transition.REQUEUE:
                     continue
                 if fits(job):
                     return self._lease(session, job, dispatcher, now)
-                if lost:  # otherwise the same loss would be counted again next time
-                    self._requeue(session, job, now, 0.0)
                 if now - job.queued_at > OVERTAKEN_SECONDS:
                     break
         return None
 
     def waiting(self, most: int = 1_000_000) -> int:
         """Return the number of jobs that could be leased now, counting up to `most`."""
-        now = self._database.clock()
-        total = 0
+        parameters = {"now": self._database.clock(), "most": most}
         with self._database.reading_rows() as connection:
-            for query in (_WAITING, _LOST):
-                total += connection.execute(query, {"now": now, "most": most - total}).scalar_one()
-        return total
+            return int(connection.execute(_WAITING, parameters).scalar_one())
 
     def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Lease:
         job.attempt += 1
@@ -328,8 +322,9 @@ class Leases:
             return sorted({str(owner) for owner in session.scalars(query)})
 
     def expire(self, dispatcher: str) -> None:
-        """Expire the leases of a dispatcher that is known to be dead."""
+        """Expire the leases of a dispatcher that is known to be dead, and forget it."""
         with self._database.writing() as session:
+            session.execute(delete(DispatcherRow).where(DispatcherRow.name == dispatcher))
             held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
             session.execute(update(JobRow).where(held).values(lease_expires_at=EXPIRED))
 
@@ -383,13 +378,13 @@ class Leases:
 
     # --- the end of an attempt -------------------------------------------------------------------------------------
 
-    def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any]) -> list[str]:
-        """End a job as succeeded and publish its results in one transaction, as `publish` does.
+    def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any]) -> None:
+        """End a job as succeeded and publish its results in one transaction; replaced files are swept.
 
         If a cancellation came too late, the job still counts as succeeded.
         """
         with self._held(lease) as (session, job, now):
-            unused = _publish(session, job, files, now)
+            _publish(session, job, files, now)
             # the colors of the unfinished job, and its checkpoint unless it can be continued
             prefixes = (LIVE,) if result.get("stopped") in CONTINUABLE else (".", LIVE)
             obsolete = or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in prefixes))
@@ -401,7 +396,6 @@ class Leases:
             _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
             observe(session, "sgsst_job_seconds", max(0.0, now - (job.started_at or now)))
             end(session, job, Transition.SUCCEED, now, self._retention)
-            return unused
 
     def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool) -> bool:
         """End a failed attempt: the job is queued again after a delay, or fails.
@@ -416,23 +410,13 @@ class Leases:
             Whether the job will be retried.
         """
         with self._held(lease) as (session, job, now):
-            verdict = self._close(session, job, AttemptOutcome.FAILED, error, now, permanent=permanent)
-            if verdict.transition != Transition.STOP:
-                job.error = error
-            if verdict.transition != Transition.REQUEUE:
-                end(session, job, verdict.transition, now, self._retention)
-                return False
-            self._requeue(session, job, now, now + verdict.wait)
-            return True
+            outcome = AttemptOutcome.FAILED
+            return self._close(session, job, outcome, error, now, permanent=permanent) == Transition.REQUEUE
 
     def release(self, lease: Lease) -> None:
         """Return an unfinished job to the queue without counting a failure, because the dispatcher is shutting down."""
         with self._held(lease) as (session, job, now):
-            verdict = self._close(session, job, AttemptOutcome.RELEASED, None, now)
-            if verdict.transition == Transition.REQUEUE:
-                self._requeue(session, job, now, 0.0)
-            else:
-                end(session, job, verdict.transition, now, self._retention)
+            self._close(session, job, AttemptOutcome.RELEASED, None, now)
 
     def stop(self, lease: Lease) -> None:
         """End a job that was being canceled."""
@@ -440,20 +424,14 @@ class Leases:
             _close_attempt(session, job, AttemptOutcome.CANCELED, None, now)
             end(session, job, Transition.STOP, now, self._retention)
 
-    def _close_lost(self, session: Session, job: JobRow, dispatcher: str, now: float) -> bool:
-        """Close an attempt whose lease `dispatcher` has found expired; return whether this has ended the job."""
+    def _close_lost(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Transition:
+        """Close an attempt whose lease `dispatcher` has found expired, as `_close` does."""
         error = {"code": _DISPATCHER_LOST, "message": "The process that ran the job stopped responding."}
         if job.lease_owner == dispatcher or self._lives(session, job):
             message = "The process that ran the job could not reach the database in time. The job will be retried."
             error = {"code": InfrastructureError.code, "message": message, "cause": Cause.DATABASE}
-        verdict = self._close(session, job, AttemptOutcome.LOST, error, now)
         count(session, "sgsst_lease_expirations_total")
-        if verdict.transition == Transition.REQUEUE:
-            return False
-        if verdict.transition == Transition.FAIL:
-            job.error = error | {"message": f"{error['message']} This was attempt {job.attempt}."}
-        end(session, job, verdict.transition, now, self._retention)
-        return True
+        return self._close(session, job, AttemptOutcome.LOST, error, now)
 
     def _lives(self, session: Session, job: JobRow) -> bool:
         """Return whether the dispatcher of an expired lease has reported after it failed to renew the lease."""
@@ -470,15 +448,21 @@ class Leases:
         now: float,
         *,
         permanent: bool = False,
-    ) -> Verdict:
-        """Close an attempt and count it if it failed; return the verdict on the job."""
+    ) -> Transition:
+        """Close an attempt, then end its job or queue it again; return the job's transition."""
         _close_attempt(session, job, outcome, error, now)
         causes = _causes(session, job) or [cause_of(error)]
         if causes[0] not in (Cause.JOB, Cause.DISPATCHER):
             count(session, "sgsst_outages_total", f'cause="{causes[0]}"')
-        verdict = self._policy.after_attempt(outcome, job, causes, permanent=permanent)
-        job.failures, job.failed_step = verdict.failures, verdict.failed_step
-        return verdict
+        transition, wait = self._policy.after_attempt(outcome, job, causes, permanent=permanent)
+        if transition == Transition.FAIL or (transition == Transition.REQUEUE and outcome == AttemptOutcome.FAILED):
+            job.error = error
+        if transition == Transition.REQUEUE:
+            job.not_before, job.lease_owner, job.lease_expires_at = now + wait, None, None
+            move(session, job, transition, now)
+        else:
+            end(session, job, transition, now, self._retention)
+        return transition
 
     # --- shared ----------------------------------------------------------------------------------------------------
 
@@ -496,12 +480,6 @@ class Leases:
                 raise _lost(lease)
             yield session, job, now
 
-    @staticmethod
-    def _requeue(session: Session, job: JobRow, now: float, not_before: float) -> None:
-        job.not_before = not_before
-        job.lease_owner = job.lease_expires_at = None
-        move(session, job, Transition.REQUEUE, now)
-
 
 def _lost(lease: Lease) -> ServiceError:
     return problems.LEASE_LOST(job_id=lease.job_id, epoch=lease.epoch, dispatcher=lease.dispatcher)
@@ -512,21 +490,15 @@ def _is_held(job: JobRow, lease: Lease) -> bool:
 
 
 def _publish(session: Session, job: JobRow, files: Sequence[Published], now: float) -> list[str]:
-    unused = []
+    replaced = []
     for file in files:
         if file.step is not None:
             job.saved_step = max(job.saved_step or 0, file.step)
-        row = session.get(ArtifactRow, (job.id, file.name))
-        if row is None:
-            row = ArtifactRow(job_id=job.id, name=file.name)
-            session.add(row)
-        elif row.location != file.location:
-            unused.append(row.location)
-        row.location, row.size, row.sha256, row.created_at = file.location, file.size, file.sha256, now
+        replaced += put_artifact(session, job.id, file, now)
         if not file.name.startswith("."):
             data = {"name": file.name, "size": file.size, "sha256": file.sha256}
             add_event(session, job.id, "artifact", data, now)
-    return unused
+    return replaced
 
 
 def _causes(session: Session, job: JobRow) -> list[Cause]:
@@ -553,3 +525,150 @@ def _close_attempt(
             else:
                 add_usage(session, job.owner, now, cpu_seconds=max(0.0, now - attempt.started_at))
     count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')
+
+
+# --- monitoring and webhooks ---------------------------------------------------------------------------------------
+
+#: Whether a PostgreSQL server accepts no writes; a standby does not.
+_READ_ONLY = text("SHOW transaction_read_only")
+
+
+def _counted(counts: Mapping[str, int], column: SQLColumnExpression[str]) -> ColumnElement[int]:
+    """Return an SQL expression for the count of a column's value; 0 for values without a count."""
+    return case(dict(counts), value=column, else_=0) if counts else literal(0)
+
+
+class Operations:
+    """Operations for monitoring and webhooks."""
+
+    def __init__(self, database: Database, lease_seconds: float) -> None:
+        self._database = database
+        self._lease_seconds = lease_seconds
+
+    def record_heartbeat(self, name: str, slots: int, free: int) -> None:
+        """Record a dispatcher's heartbeat with its total and free capacity."""
+        now = self._database.clock()
+        values = {"seen_at": now, "slots": slots, "free": free}
+        with self._database.writing() as session:
+            insert = upsert(session)(DispatcherRow).values(name=name, **values)
+            session.execute(insert.on_conflict_do_update(index_elements=["name"], set_=values))
+
+    def remove_dispatcher(self, name: str) -> None:
+        """Remove a dispatcher that has ended."""
+        with self._database.writing() as session:
+            session.execute(delete(DispatcherRow).where(DispatcherRow.name == name))
+
+    def dispatchers(self) -> list[DispatcherRow]:
+        """Return the live dispatchers: those with a heartbeat within a lease duration."""
+        alive = select(DispatcherRow).where(self._is_alive()).order_by(DispatcherRow.name)
+        with self._database.reading() as session:
+            return list(session.scalars(alive))
+
+    def check(self) -> int:
+        """Query the database for a health check, and return the number of live dispatchers.
+
+        Raises:
+            DatabaseUnavailableError: If the database does not respond within some seconds, or accepts no writes.
+        """
+        alive = select(func.count()).select_from(DispatcherRow).where(self._is_alive())
+        with self._database.reserved_connection() as connection:
+            if not self._database.sqlite and connection.scalar(_READ_ONLY) == "on":
+                raise problems.DATABASE_UNAVAILABLE()
+            return connection.execute(alive).scalar_one()
+
+    def _is_alive(self) -> ColumnElement[bool]:
+        """Return the condition of a heartbeat within a lease duration. One far in the future is of a wrong clock."""
+        now = self._database.clock()
+        return DispatcherRow.seen_at.between(now - self._lease_seconds, now + self._lease_seconds)
+
+    def counters(self) -> list[tuple[str, str, float]]:
+        """Return name, labels and value of every counter."""
+        with self._database.reading() as session:
+            rows = session.scalars(select(CounterRow).order_by(CounterRow.name, CounterRow.labels)).all()
+        return [(row.name, row.labels, row.value) for row in rows]
+
+    def work(self) -> tuple[dict[str, int], float, float]:
+        """Return the number of jobs by status, the waiting time of the oldest queued one, and the steps per second.
+
+        Times are in seconds. They are 0 if no job is queued, and if none makes steps.
+        """
+        counts = select(JobRow.status, func.count()).group_by(JobRow.status)
+        with self._database.reading() as session:
+            by_status = dict(session.execute(counts).all())
+            oldest = session.scalar(select(func.min(JobRow.queued_at)).where(JobRow.status == JobStatus.QUEUED))
+            running = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
+        waited = 0.0 if oldest is None else max(0.0, self._database.clock() - oldest)
+        rates = (each["step"] / each["seconds"] for each in running if each and each.get("seconds"))
+        return by_status, waited, sum(rates)
+
+    def webhook_secret(self) -> str:
+        """Return the secret that signs webhooks, in the format of Standard Webhooks; it is created on first use."""
+        secret = "whsec_" + base64.b64encode(secrets.token_bytes(32)).decode()
+        with self._database.writing() as session:
+            insert = upsert(session)(SecretRow).values(name="webhooks", value=secret)
+            session.execute(insert.on_conflict_do_nothing())
+            return session.get_one(SecretRow, "webhooks").value
+
+    def due_deliveries(
+        self,
+        hold_seconds: float,
+        sending: Collection[tuple[DeliveryRow, str]],
+        *,
+        total: int,
+        per_owner: int,
+        per_url: int,
+    ) -> list[tuple[DeliveryRow, str]]:
+        """Claim due messages for sending; no other dispatcher gets them for `hold_seconds`.
+
+        Each message counts this attempt, and comes with the owner of its job: an empty text if the job is deleted.
+
+        Args:
+            sending: Messages that this dispatcher is already sending; they count toward the limits.
+            total, per_owner, per_url: Maximum numbers of messages sent at the same time. The latter two keep a receiver
+                that does not respond, or an owner with many such receivers, from delaying the messages of others.
+        """
+        now = self._database.clock()
+        owner = func.coalesce(JobRow.owner, "")  # messages of deleted jobs count as those of one owner
+        per_url_rank = func.row_number().over(partition_by=DeliveryRow.url, order_by=DeliveryRow.next_at)
+        due = (
+            select(DeliveryRow.id, DeliveryRow.next_at, owner.label("owner"))
+            .add_columns(
+                (per_url_rank + _counted(Counter(row.url for row, _ in sending), DeliveryRow.url)).label("rank")
+            )
+            .outerjoin(JobRow, JobRow.id == DeliveryRow.job_id)
+            .where(DeliveryRow.next_at <= now)
+            .subquery()
+        )
+        per_owner_rank = func.row_number().over(partition_by=due.c.owner, order_by=due.c.next_at)
+        turns = (
+            select(due.c.id, due.c.owner)
+            .add_columns(
+                (per_owner_rank + _counted(Counter(holder for _, holder in sending), due.c.owner)).label("rank")
+            )
+            .where(due.c.rank <= per_url)
+            .subquery()
+        )
+        query = (
+            select(DeliveryRow, turns.c.owner)
+            .join(turns, turns.c.id == DeliveryRow.id)
+            .where(turns.c.rank <= per_owner, DeliveryRow.next_at <= now)  # checked again once the row is locked
+            .order_by(DeliveryRow.next_at)
+            .limit(max(0, total - len(sending)))
+            .with_for_update(of=DeliveryRow, skip_locked=True)
+        )
+        with self._database.writing() as session:
+            taken = [(row, holder) for row, holder in session.execute(query).all()]
+            for row, _ in taken:
+                row.tries += 1
+                row.next_at = now + hold_seconds
+            return taken
+
+    def settle_delivery(self, delivery_id: str, wait_seconds: float | None) -> None:
+        """Make a message due again after `wait_seconds`; if None, delete it because it was delivered or given up."""
+        settled = DeliveryRow.id == delivery_id
+        with self._database.writing() as session:
+            if wait_seconds is None:
+                session.execute(delete(DeliveryRow).where(settled))
+            else:
+                again = self._database.clock() + wait_seconds
+                session.execute(update(DeliveryRow).where(settled).values(next_at=again))

@@ -20,9 +20,9 @@ from service.states import (
 EXPECTED = """
             take      start     succeed    fail    requeue  stop      finish     cancel     retry   expire
 queued      starting  .         .          .       .        .         .          canceled   .       .
-starting    starting  running   succeeded  failed  queued   canceled  .          canceling  .       .
-running     starting  running   succeeded  failed  queued   canceled  finishing  canceling  .       .
-finishing   starting  .         succeeded  failed  queued   canceled  finishing  canceling  .       .
+starting    .         running   succeeded  failed  queued   canceled  .          canceling  .       .
+running     .         running   succeeded  failed  queued   canceled  finishing  canceling  .       .
+finishing   .         .         succeeded  failed  queued   canceled  finishing  canceling  .       .
 canceling   .         canceling succeeded  .       .        canceled  .          canceling  .       .
 succeeded   .         .         .          .       .        .         .          .          queued  expired
 failed      .         .         .          .       .        .         .          .          queued  expired

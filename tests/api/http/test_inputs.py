@@ -132,7 +132,7 @@ def test_inputs_of_deleted_job_are_not_found(client: httpx2.Client, paths: dict[
     client.post(f"/v1/jobs/{job_id}/cancel")
     assert client.get(f"/v1/jobs/{job_id}/inputs/scene").status_code == 200
     later = open_store(ServiceSettings(data=Path(store.database.url.database or "").parent), lambda: 1e11)
-    later.retention.expire()
+    later.jobs.expire()
     later.close()
     assert client.get(f"/v1/jobs/{job_id}").json()["status"] == "expired"
     assert len(client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]) == 3, "what they were is still known"

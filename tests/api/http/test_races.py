@@ -56,7 +56,7 @@ class Job:
         """Publish a file derived from the result, as conversions do; the file itself does not matter here."""
         source = self.store.jobs.artifact(self.id, "stylized.ply")
         if source is not None:
-            self.store.jobs.add_derived(source, [Published("stylized.spz", "x", 1, "0" * 64)], "local", replace=True)
+            self.store.jobs.add_derived(source, [Published("stylized.spz", "x", 1, "0" * 64)], "local")
         return 200
 
     def work(self) -> int:

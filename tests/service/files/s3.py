@@ -13,16 +13,13 @@ import pytest
 
 from tests.http_servers import LocalServer
 
-#: "slow-down": 503, S3's response to too many requests. "not-implemented": 501. "reset": the connection is closed
-#: before the response. "cut-off": it is closed in the middle of the response. "silence": there is no response until
-#: `heal`.
-Fault = Literal["slow-down", "not-implemented", "reset", "cut-off", "silence"]
+#: "slow-down": 503, S3's response to too many requests. "reset": the connection is closed before the response.
+#: "cut-off": it is closed in the middle of the response. "silence": there is no response until `heal`.
+Fault = Literal["slow-down", "reset", "cut-off", "silence"]
 
 _SLOW_DOWN = (
     b"<?xml version='1.0'?><Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"
 )
-
-_NOT_IMPLEMENTED = b"<?xml version='1.0'?><Error><Code>NotImplemented</Code><Message>No.</Message></Error>"
 
 
 @contextmanager
@@ -90,8 +87,6 @@ class FaultyS3(LocalServer):
         fault = self._fault(handler.command, handler.path)
         if fault == "slow-down":
             self._send(handler, 503, {"Content-Type": "application/xml"}, _SLOW_DOWN)
-        elif fault == "not-implemented":
-            self._send(handler, 501, {"Content-Type": "application/xml"}, _NOT_IMPLEMENTED)
         elif fault == "reset":
             self._reset(handler)
         elif fault == "silence":

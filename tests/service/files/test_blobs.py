@@ -178,24 +178,18 @@ def _file(folder: Path, data: bytes) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("first", "able", "joined"), [(6 * MB, True, True), (6 * MB, False, False)])
-def test_upload_continues_on_another_host(fleet: Fleet, first: int, able: bool, joined: bool) -> None:
-    data = os.urandom(8 * MB)
+def test_upload_continues_on_another_host(fleet: Fleet) -> None:
+    data, first = os.urandom(8 * MB), 6 * MB
     upload = fleet.upload(len(data))
     fleet.append(fleet.host("one"), upload, data[:1000], data[1000:first])
     two = fleet.host("two")
     fleet.append(two, upload, data[first:])
     assert fleet.again(upload).offset == len(data)
     assert len(fleet.names()) == 2
-    before = len(fleet.s3.asked)
-    if not able:
-        fleet.s3.fail("not-implemented", 1, lambda method, path: method == "PUT" and "partNumber=" in path)
     sha256 = two.finish_upload(fleet.again(upload), HOUR)
     assert sha256 == hashlib.sha256(data).hexdigest()
     assert [name.split("/")[0] for name in fleet.names()] == ["blobs"]
     assert fleet.read(fleet.host("three"), sha256) == data
-    copied = [path for method, path in fleet.s3.asked[before:] if method == "PUT" and "partNumber=" in path]
-    assert (len(copied) >= 2) == joined
     assert two.finish_upload(fleet.again(upload), HOUR) == sha256, "another request has finished it already"
 
 
@@ -244,7 +238,6 @@ def test_disk_without_a_free_byte_is_full(tmp_path: Path, fleet: Fleet, monkeypa
     blobs = BlobFolder(tmp_path / "data", fleet.store.inputs, 0)
     for free, full in ((0, True), (1, False)):
         monkeypatch.setattr("service.files.blobs.shutil.disk_usage", lambda _, free=free: SimpleNamespace(free=free))
-        assert (blobs.missing_space(0) > 0) == full
         with pytest.raises(NoSpaceError) if full else nullcontext():
             blobs.ensure_space(0)
     with pytest.raises(NoSpaceError):

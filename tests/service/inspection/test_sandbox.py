@@ -165,8 +165,6 @@ def forger(folder: Path, answer: str) -> Path:
         pytest.param('{"error": {}}', marks=pytest.mark.slow),
         pytest.param('{"error": {"code": 1, "message": [], "input": {}}}', marks=pytest.mark.slow),
         '{"findings": 7}',
-        '{"checked": {}}\n{"findings": {}}',
-        '{"checked": {"gaussians": 7, "views": 7, "pixels": 7}}\n{"findings": {}}',
         '{"planning": {"stage": "planning", "step": "x", "total": [], "fraction": {}, "eta_s": 0}}\n{"findings": {}}',
         '{"findings": {}}\n{"findings": {"gaussians": 7}}',
     ],

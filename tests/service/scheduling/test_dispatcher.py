@@ -175,7 +175,7 @@ def test_leftovers_of_a_killed_dispatcher_are_swept(settings: ServiceSettings, s
     running = new_lease(store, "elsewhere")
     published_next = artifacts.put(running.job_id, running.epoch, "stylized.ply", source)
     with at_work(settings, store):
-        wait_for(lambda: store.retention.unswept(10) == [], "the job to be swept")
+        wait_for(lambda: store.jobs.unswept(10) == [], "the job to be swept")
     left = {path.name for path in (settings.folder / "artifacts" / held.job_id).rglob("*.*")}
     assert left == {"stylized.ply"}
     assert b"".join(artifacts.objects.read(result.location, 0, 3)) == b"ply"

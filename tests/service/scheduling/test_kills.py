@@ -84,7 +84,8 @@ def check_published_once(service: Service, job_id: str) -> bytes:
         events = [(sent.event, json.loads(sent.data)) for sent in stream if sent.data]
     assert [data["name"] for kind, data in events if kind == "artifact"].count("stylized.ply") == 1
     assert [data["status"] for kind, data in events if kind == "status"].count("succeeded") == 1
-    assert len(list((service.data / "artifacts" / job_id).rglob("stylized.ply"))) == 1
+    folder = service.data / "artifacts" / job_id
+    wait_for(lambda: len(list(folder.rglob("stylized.ply"))) == 1, "the files of killed attempts to be swept")
     answer = httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply", timeout=60)
     assert f'"{hashlib.sha256(answer.content).hexdigest()}"' == answer.headers["etag"]
     return answer.content

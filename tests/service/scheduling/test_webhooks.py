@@ -330,13 +330,13 @@ def _check_turns(store: Store) -> None:
     for _ in range(3):
         _end_job(store, "http://b/", owner="b")
     first = store.operations.due_deliveries(60, [], **limits)
-    assert sorted(each.url for each in first if each.owner == "a") == ["http://a/0"] * 2 + ["http://a/1"] * 2
-    assert [each.url for each in first if each.owner == "b"] == ["http://b/"] * 2
+    assert sorted(each.url for each, owner in first if owner == "a") == ["http://a/0"] * 2 + ["http://a/1"] * 2
+    assert [each.url for each, owner in first if owner == "b"] == ["http://b/"] * 2
     assert store.operations.due_deliveries(60, first, **limits) == []
-    going = [each for each in first if each.url == "http://a/0"]
+    going = [claimed for claimed in first if claimed[0].url == "http://a/0"]
     second = store.operations.due_deliveries(60, going, **limits)
-    assert sorted(each.url for each in second) == ["http://a/1"] * 2 + ["http://b/"]
-    taken = [each.id for each in [*first, *second]]
+    assert sorted(each.url for each, _ in second) == ["http://a/1"] * 2 + ["http://b/"]
+    taken = [each.id for each, _ in [*first, *second]]
     assert len(set(taken)) == len(taken)
     store.close()
 

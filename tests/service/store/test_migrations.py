@@ -11,7 +11,6 @@ import pytest
 from sqlalchemy import text
 
 from service.store.database import MIGRATIONS, SCHEMA, Database
-from sgsst_core.errors import SettingsError
 from tests.api.service import ROOT, Service, wait_for
 from tests.api.service import submit as submit_job
 from tests.small_scenes import input_files
@@ -22,16 +21,6 @@ VERSIONS = sorted(path.name[:4] for path in (MIGRATIONS / "versions").glob("[0-9
 def test_migrations_are_numbered_in_order() -> None:
     assert VERSIONS[-1] == SCHEMA
     assert [f"{int(VERSIONS[0]) + number:04d}" for number in range(len(VERSIONS))] == VERSIONS
-
-
-def test_database_of_an_earlier_development_version_is_refused(tmp_path: Path) -> None:
-    database = Database(f"sqlite:///{tmp_path / 'sgsst.db'}")
-    database.upgrade()
-    with database.writing() as session:
-        session.execute(text("UPDATE alembic_version SET version_num = '0009'"))
-    with pytest.raises(SettingsError, match=r"sgsst\.db.*development version \(0009\).*another data folder"):
-        database.upgrade()
-    database.close()
 
 
 def next_version(folder: Path) -> Path:

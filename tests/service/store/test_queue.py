@@ -10,7 +10,6 @@ from service.store.queue import (
     MAX_LOSSES,
     MAX_RETRY_SECONDS,
     RetryPolicy,
-    Verdict,
     cause_of,
 )
 from service.store.tables import JobRow
@@ -82,20 +81,22 @@ def job(
 def test_failures_count_only_without_progress(
     before: tuple[int, int | None], saved: int | None, after: tuple[int, int | None]
 ) -> None:
-    verdict = POLICY.after_attempt(AttemptOutcome.FAILED, job(*before, saved))
-    assert (verdict.failures, verdict.failed_step) == after
+    failed = job(*before, saved)
+    POLICY.after_attempt(AttemptOutcome.FAILED, failed)
+    assert (failed.failures, failed.failed_step) == after
 
 
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST, AttemptOutcome.RELEASED])
 @pytest.mark.parametrize("permanent", [False, True])
 def test_canceling_job_is_stopped(outcome: AttemptOutcome, permanent: bool) -> None:
-    decision = POLICY.after_attempt(outcome, job(2, 3, 3, JobStatus.CANCELING), permanent=permanent)
-    assert decision == Verdict(Transition.STOP, 2, 3)
+    canceled = job(2, 3, 3, JobStatus.CANCELING)
+    assert POLICY.after_attempt(outcome, canceled, permanent=permanent) == (Transition.STOP, 0.0)
+    assert (canceled.failures, canceled.failed_step) == (2, 3)
 
 
 def test_retry_delay_doubles_up_to_its_maximum() -> None:
     policy = RetryPolicy(max_attempts=100, retry_seconds=5.0)
-    waits = [policy.after_attempt(AttemptOutcome.FAILED, job(failures)).wait for failures in range(9)]
+    waits = [policy.after_attempt(AttemptOutcome.FAILED, job(failures))[1] for failures in range(9)]
     assert waits == [5, 10, 20, 40, 80, 160, MAX_RETRY_SECONDS, MAX_RETRY_SECONDS, MAX_RETRY_SECONDS]
 
 
@@ -127,22 +128,23 @@ def test_cause_of_recorded_error(error: dict[str, str] | None, cause: Cause) -> 
 def test_only_own_failures_count(cause: Cause, outcome: AttemptOutcome) -> None:
     count, waits = (POLICY.max_attempts - 1, 10), []
     for repeated in range(1, MAX_LOSSES):
-        verdict = POLICY.after_attempt(outcome, job(*count, 10), [cause] * repeated + [Cause.JOB])
-        assert (verdict.transition, verdict.failures, verdict.failed_step) == (Transition.REQUEUE, *count)
-        waits.append(verdict.wait)
+        ended = job(*count, 10)
+        transition, wait = POLICY.after_attempt(outcome, ended, [cause] * repeated + [Cause.JOB])
+        assert (transition, ended.failures, ended.failed_step) == (Transition.REQUEUE, *count)
+        waits.append(wait)
     lost = outcome == AttemptOutcome.LOST
     assert waits[:3] == [0.0 if lost else POLICY.retry_seconds * factor for factor in (1, 2, 4)]
     assert waits[-1] == (0.0 if lost else MAX_RETRY_SECONDS)
-    assert POLICY.after_attempt(outcome, job(*count, 10, JobStatus.CANCELING), [cause]).transition == Transition.STOP
+    assert POLICY.after_attempt(outcome, job(*count, 10, JobStatus.CANCELING), [cause])[0] == Transition.STOP
 
 
 @pytest.mark.parametrize("cause", OTHERS)
 def test_job_that_may_end_its_dispatchers_fails_at_last(cause: Cause) -> None:
     """An outage never fails a job, however often it occurs."""
-    verdict = POLICY.after_attempt(AttemptOutcome.LOST, job(), [cause] * MAX_LOSSES)
-    assert verdict.transition == (Transition.FAIL if cause == Cause.DISPATCHER else Transition.REQUEUE)
+    transition, _ = POLICY.after_attempt(AttemptOutcome.LOST, job(), [cause] * MAX_LOSSES)
+    assert transition == (Transition.FAIL if cause == Cause.DISPATCHER else Transition.REQUEUE)
     mixed = [Cause.DISPATCHER, Cause.DATABASE] * MAX_LOSSES
-    assert POLICY.after_attempt(AttemptOutcome.LOST, job(), mixed).transition == (Transition.REQUEUE)
+    assert POLICY.after_attempt(AttemptOutcome.LOST, job(), mixed)[0] == Transition.REQUEUE
 
 
 @pytest.mark.parametrize("status", [JobStatus.STARTING, JobStatus.RUNNING, JobStatus.CANCELING])
@@ -150,5 +152,5 @@ def test_job_that_may_end_its_dispatchers_fails_at_last(cause: Cause) -> None:
 @pytest.mark.parametrize("permanent", [False, True])
 def test_every_verdict_is_an_allowed_transition(status: JobStatus, outcome: AttemptOutcome, permanent: bool) -> None:
     for failures in range(POLICY.max_attempts + 1):
-        verdict = POLICY.after_attempt(outcome, job(failures, status=status), permanent=permanent)
-        assert status in TRANSITIONS[verdict.transition]
+        transition, _ = POLICY.after_attempt(outcome, job(failures, status=status), permanent=permanent)
+        assert status in TRANSITIONS[transition]

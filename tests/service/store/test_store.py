@@ -362,9 +362,9 @@ def test_job_is_kept_as_long_as_requested_at_most_as_the_service_keeps_it(
     store.leases.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {})
     for status in ("expired", None):
         clock.now += seconds - 1
-        assert store.retention.expire() == []
+        assert store.jobs.expire() == []
         clock.now += 2
-        assert store.retention.expire() == [job_id]
+        assert store.jobs.expire() == [job_id]
         shown = store.jobs.page("local")
         assert [job.row.status for job in shown] == ([status] if status else [])
 

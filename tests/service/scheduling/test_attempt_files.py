@@ -3,7 +3,6 @@
 import multiprocessing
 import os
 import pickle
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from safetensors.numpy import save_file
 from service.files.objects import Artifacts
 from service.inputs import CHECKPOINT
 from service.problems import LostFileError, StoreError
-from service.scheduling import publishing, rank_folder
+from service.scheduling import attempt_files
 from service.scheduling.messages import StoreWorkplace
 from service.states import Published
 from sgsst_core.errors import InfrastructureError
@@ -35,9 +34,8 @@ def s3(s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
     assert httpx2.put(f"{s3_url}/files").status_code == 200
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "node"))
     monkeypatch.setenv("SGSST_CACHE", os.environ.get("SGSST_CACHE", ""))
-    monkeypatch.setattr(rank_folder, "_SCAN_SECONDS", 0.05)
-    monkeypatch.setattr(rank_folder, "_RETRY_SECONDS", 0.1)
-    monkeypatch.setattr(publishing, "_RETRY_SECONDS", 0.1)
+    monkeypatch.setattr(attempt_files, "_SCAN_SECONDS", 0.05)
+    monkeypatch.setattr(attempt_files, "_RETRY_SECONDS", 0.1)
     with FaultyS3(s3_url) as faulty:
         for name, value in environment_of(faulty.origin).items():
             monkeypatch.setenv(name, value)
@@ -97,33 +95,11 @@ def test_files_are_fetched_once_for_all_ranks_of_a_machine(s3: FaultyS3, job: St
     assert not [path for path in (tmp_path / "node" / "ranks").iterdir() if path.is_dir()]
 
 
-@pytest.mark.parametrize("kind", ["link", "writable", "file"])
-def test_temporary_folder_of_others_is_refused(
-    kind: str, job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its content is neither used nor deleted."""
+def test_machine_without_a_data_folder_is_refused(job: StoreWorkplace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SGSST_DATA")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    other, folder = tmp_path / "other", tmp_path / f"sgsst-{os.getuid()}"
-    (other / "ranks" / "old").mkdir(parents=True)
-    if kind == "link":
-        folder.symlink_to(other)
-    elif kind == "writable":
-        other.rename(folder)
-        folder.chmod(0o777)
-    else:
-        folder.touch()
-    with pytest.raises(InfrastructureError, match="only this user can write to"):
+    with pytest.raises(InfrastructureError, match="has no SGSST_DATA"):
         job.open(1, Recorder())
     job.tidy()
-    assert kind == "file" or (folder / "ranks" / "old").is_dir()
-
-
-def test_temporary_folder_is_private(job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("SGSST_DATA")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    job.open(1, Recorder()).close()
-    assert (tmp_path / f"sgsst-{os.getuid()}").stat().st_mode & 0o777 == 0o700
 
 
 def test_first_rank_uploads_files_while_it_runs(job: StoreWorkplace) -> None:
@@ -199,9 +175,9 @@ def test_weights_are_fetched_by_digest(
 ) -> None:
     monkeypatch.setenv("SGSST_CACHE", str(tiny_cache))
     expected = load_network_weights("vgg16").sha256
-    weights = rank_folder.store_weights(Artifacts(job.url).objects)
+    weights = attempt_files.store_weights(Artifacts(job.url).objects)
     assert "vgg16.safetensors" in [file.name for file in weights]
-    assert rank_folder.store_weights(Artifacts(job.url).objects) == weights
+    assert attempt_files.store_weights(Artifacts(job.url).objects) == weights
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "nothing is installed here"))
     rank = replace(job, weights=weights).open(1, Recorder())
     assert os.environ["SGSST_CACHE"] != str(tiny_cache)
