@@ -59,6 +59,8 @@ FINISHED = ("succeeded", "failed", "canceled", "expired")
 PATIENCE = 900.0
 #: Number of unfinished jobs to maintain, of kills at random, and of kills of a rank.
 _QUEUE, _KILLS, _RANK_KILLS = 2, 100, 6
+#: Seconds until files of killed attempts that remain after housekeeping count as published.
+_SWEEP_SECONDS = 180.0
 
 
 @dataclass
@@ -238,8 +240,10 @@ def attack_ranks(run: Run, chance: random.Random) -> str:
 
 
 def published(run: Run, job_id: str) -> int:
-    """Return how often a job's result was announced or stored on disk, whichever is more."""
-    stored = len(list((run.service.data / "artifacts" / job_id).rglob("stylized.ply")))
+    """Return how often a job's result was announced or stored on disk, whichever is more, after housekeeping."""
+    folder, deadline = run.service.data / "artifacts" / job_id, time.monotonic() + _SWEEP_SECONDS
+    while (stored := len(list(folder.rglob("stylized.ply")))) > 1 and time.monotonic() < deadline:
+        time.sleep(1)
     return max(run.published(job_id), stored)
 
 

@@ -429,6 +429,7 @@ class RankProcess:
                 result = self._job(task, collectives)
                 if place is not None:
                     place.finish(done=result.stopped != "interrupted")
+                    place.close()  # already here, because the driver ends this process once it has the outcome
                 self._update(outcome=Outcome(result))
             except BaseException as error:
                 self._update(outcome=_failure(error))

@@ -178,12 +178,13 @@ def run_service(settings: ServiceSettings, announce: Callable[[str], None]) -> N
 
 def _listen(settings: ServiceSettings) -> socket.socket:
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    address, both = (settings.host, settings.port), family == socket.AF_INET6
+    address, both = (settings.host, settings.port), family == socket.AF_INET6 and socket.has_dualstack_ipv6()
     try:
         return socket.create_server(address, family=family, backlog=_BACKLOG, dualstack_ipv6=both)
     except OSError as error:
+        reason = str(error.strerror).partition(" (")[0]  # Python adds the address
         raise SettingsError(
-            f"Cannot listen on {settings.host}:{settings.port}: {error.strerror}. Choose another port with --port."
+            f"Cannot listen on {settings.host}:{settings.port}: {reason}. Choose another port with --port."
         ) from error
 
 

@@ -167,7 +167,7 @@ def run_rank(rank: int, address: str, folder: str, sizes: Sizes) -> None:
         torch.set_num_threads(1)
         triton_interpreter.prepare()
     dist.init_process_group("gloo", init_method=f"tcp://{address}", rank=rank, world_size=RANKS)
-    collectives = ProcessGroupCollectives(dist.group.WORLD, device(), timedelta(seconds=60))
+    collectives = ProcessGroupCollectives(dist.group.WORLD, timedelta(seconds=60))
     try:
         torch.save(follow_ranks(collectives, sizes), Path(folder) / f"{rank}.pt")
     finally:

@@ -341,7 +341,10 @@ def _limits(settings: ServiceSettings) -> dict[str, int]:
 
 def _planning_seconds(findings: dict[str, Any], limits: dict[str, int]) -> float:
     """Return the CPU seconds that planning may take, from the findings of an untrusted process about the inputs."""
-    gaussians, views, pixels = (min(max(findings[name], 0), limits[name]) for name in ("gaussians", "views", "pixels"))
+    sizes = {name: findings.get(name) for name in ("gaussians", "views", "pixels")}
+    gaussians, views, pixels = (
+        min(max(size, 0), limits[name]) if isinstance(size, int) else 0 for name, size in sizes.items()
+    )
     trial = _TRIAL_SECONDS_PER_PIXEL * pixels / max(views, 1)
     return float(_SECONDS_PER_GAUSSIAN * gaussians * views + _SECONDS_PER_PIXEL * pixels + trial)
 

@@ -204,6 +204,8 @@ class FileCheck:
         held = exists().where(BlobUseRow.sha256 == file.sha256) if file.table is BlobRow else false()
         with self._database.writing() as session:
             deleted = session.execute(delete(file.table).where(file.row, ~held))
+            if file.table is UploadRow and deleted.rowcount:  # type: ignore[attr-defined]  # a blob may be made already
+                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == file.holder))
             return "its row is deleted" if deleted.rowcount else "it comes back when it is sent again"  # type: ignore[attr-defined]
 
     # --- files that rows refer to ----------------------------------------------------------------------------------

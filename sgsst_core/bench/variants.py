@@ -336,7 +336,7 @@ class VariantResult:
     Attributes:
         name: Name of the variant, or `UNSTYLIZED`, or `TRANSFER`.
         sh_dc: Colors [N, 3].
-        short, long: Short- and long-range consistency, whose LPIPS is that of VGG16; None if there is no such pair.
+        short, long: Short- and long-range consistency; None if there is no such pair.
         loss: Remaining loss, relative to the unstylized scene; None if it was not measured.
     """
 

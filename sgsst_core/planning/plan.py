@@ -460,12 +460,15 @@ LOSS_VIEWS, NOVEL_VIEWS = 4, 4
 _NOVEL_PASSES = 2
 #: Bytes per optimized Gaussian: color, gradient and two moments, float32.
 OPTIMIZER_BYTES = 4 * 3 * 4
-#: Bytes of a process before it reads a scene: libraries, compiled kernels and the network (peak_memory.json).
+#: Bytes of a process before it reads a scene: libraries, compiled kernels and the network.
 _PROCESS_BYTES = 900_000_000
 #: Bytes per Gaussian beside its stored values: the file's, those of the rendered scene, and the neighbor search.
 _GAUSSIAN_BYTES = 400
 #: Bytes per pixel and scale of a view's targets: content features (relu4_2), coverage, and its image.
 _TARGET_BYTES = 32
+#: Bytes per pixel of a view in a step: image, coverage, their gradients, and those at the other scales. A step at
+#: 5187x3361 took 64 bytes per pixel more than everything else.
+_STEP_BYTES = 80
 
 
 # --- choices -------------------------------------------------------------------------------------------------------
@@ -663,12 +666,14 @@ def _with_memory(plan: Plan, facts: Facts, pixels: NetworkPixels) -> Plan:
     # A CUDA graph does not share its memory: evaluating the loss without the graph needs the same amount again.
     needed += activations * plan.graphs
     spare = max(budget - needed, 0) if plan.device == "cuda" and facts.machine.ranks == 1 else 0
-    areas = sum(facts.sizes[index][0] * facts.sizes[index][1] for index in plan.covered)
+    sizes = [facts.sizes[index][0] * facts.sizes[index][1] for index in plan.covered]
+    areas = sum(sizes)
     of_views = int(4 / 3 * _TARGET_BYTES * areas) + 12 * facts.gaussians * len(plan.covered) * bool(facts.used_degree)
     cached = 0 if plan.cached_weights == "none" else (facts.weight_bytes or (0, 0))[plan.cached_weights == "half"]
     of_novel_views = 4 * plan.novel_views * _TARGET_BYTES * areas // len(plan.covered)
     used = (
         needed
+        + _STEP_BYTES * max(sizes, default=0)
         + min(of_views, memory_for("views", memory) + spare // 2)
         + min(facts.intersection_bytes + cached, memory_for("rasterizer", memory) + spare // 2)
         + min(of_novel_views, memory_for("measuring", memory))

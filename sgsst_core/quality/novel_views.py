@@ -28,13 +28,15 @@ from sgsst_core.planning.survey import sees_something
 from sgsst_core.quality.judge import MIN_SIDE, Lpips, shown
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions import RegionMaps
-from sgsst_core.scene.camera import Camera, between, moved, nearest_walk, similarly_rotated, spread
+from sgsst_core.scene.camera import Camera, between, moved, nearest_walk, resized, similarly_rotated, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.stylizer import ShowViews, show_nothing
 from sgsst_core.stylizing.views import ViewColors
 
 #: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
 MAX_VIEWS = 4
+#: Longer side in pixels of the renders that show whether a view sees anything.
+_SEEN_SIDE = 160
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,8 @@ class NovelViews:
         # Use the first views of the short-range pairs: they are rendered anyway, and spread just as evenly.
         views = [first for first, _ in chosen[SHORT_RANGE]] or list(range(min(len(self.cameras), most)))
         used = {*views, *(index for pairs in chosen.values() for pair in pairs for index in pair)}
-        seeing = {index for index in used if sees_something(rasterizer.coverage(self.cameras[index]))}
+        small = {index: resized(self.cameras[index], min(_SEEN_SIDE, self.cameras[index].side)) for index in used}
+        seeing = {index for index, camera in small.items() if sees_something(rasterizer.coverage(camera))}
         self.views = [index for index in views if index in seeing]
         self.pairs = {gap: [pair for pair in pairs if seeing.issuperset(pair)] for gap, pairs in chosen.items()}
         self._colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 8)

@@ -124,6 +124,7 @@ def _save_grid(path: Path, grid: Sequence[Sequence[tuple[str, Image.Image] | Non
             label, image = cell or ("", None)
             if image is not None:
                 sheet.paste(image, (left, top))
+                label = label.replace("\n", " ")[: image.width]  # names in camera files may have a million characters
                 while draw.textlength(label, font) > image.width:  # narrow portrait views
                     label = label[:-1]
                 draw.text((left, top - _LABEL), label, INK, font)

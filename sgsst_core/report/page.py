@@ -364,13 +364,16 @@ def _draw_loss(figure: Figure, report: dict[str, Any]) -> None:
     if len(lines) > 1:
         several = [record["relative"] if len(record["scales"]) > 1 else None for record in records]
         lines.append(("mean", column(several), INK))
+    coarse = [record["seconds"] for record in records if record["stage"] == "coarse"]
     for label, values, color in lines:
         shown = _drawable(seconds) & _drawable(values)
+        if not shown.any():
+            continue
         x, y = seconds[shown], values[shown]
         axes.plot(x, y, color=color, alpha=0.3, linewidth=0.5)
-        means = running_mean(y, round_length(report))
+        phases = [phase for phase in np.split(y, [shown[: len(coarse)].sum()]) if len(phase)]
+        means = np.concatenate([running_mean(phase, round_length(report)) for phase in phases])
         axes.plot(x, means, color=color, label=label, marker="o" if len(x) == 1 else None)
-    coarse = [record["seconds"] for record in records if record["stage"] == "coarse"]
     if 0 < len(coarse) < len(records):
         axes.axvline(coarse[-1], color=INK, linewidth=0.8, linestyle=":")
     set_log_x(axes, seconds, "seconds")

@@ -628,14 +628,11 @@ def _relative_intrinsics(camera: Camera) -> NDArray[np.float64]:
     return np.array([*focal, camera.cx / camera.width, camera.cy / camera.height])
 
 
-#: 360-degree panoramas: the cube faces that stand for one as views, and a panorama made of renders of its faces.
-#:
-#: A panorama is an equirectangular image: longitude grows by 360 degrees from its left to its right edge, latitude
-#: falls by 180 degrees from its upper to its lower edge, and its middle lies in the direction of the z axis. Pixel
-#: centers are
-#: at half-integers. This is the model EQUIRECTANGULAR of COLMAP ("Camera Models" of its documentation) and, with
-#: OpenGL's axes, of nerfstudio.
-#:
+# A panorama is an equirectangular image: longitude grows by 360 degrees from its left to its right edge, latitude falls
+# by 180 degrees from its upper to its lower edge, and its middle lies in the direction of the z axis. Pixel centers are
+# at half-integers. This is the model EQUIRECTANGULAR of COLMAP ("Camera Models" of its documentation) and, with
+# the axes of OpenGL, of nerfstudio. Cube faces stand for a panorama as views, and renders of its faces make a panorama.
+
 #: Axes of the faces (right, down, forward) in those of the panorama. Names are as seen from inside.
 FACES: dict[str, tuple[float, ...]] = {
     "front": (1, 0, 0, 0, 1, 0, 0, 0, 1),

@@ -345,7 +345,7 @@ def _facts(context: PlanningContext, survey: Survey, inputs: JobInputs) -> Facts
         pixel_bytes=network.held_bytes_per_pixel(),
         weight_bytes=count_weights(context.rasterizer, views),
         intersection_bytes=count_intersections(context.rasterizer, len(views)),
-        frozen=inputs.regions and inputs.regions.resolved(survey.total_blend_weights).frozen,
+        frozen=inputs.regions.resolved(survey.total_blend_weights).frozen if inputs.regions else None,
     )
 
 

@@ -57,8 +57,9 @@ ROUNDS = 16
 #: Maximum number of colors sampled from each distribution, and number of knots per axis.
 _SAMPLES = 1 << 16
 _KNOTS = 1 << 9
-#: Number of colors that are moved together: their intermediate results stay in the processor's cache.
-_TOGETHER = 1 << 16
+#: Number of colors that are moved together, so few that intermediate results stay in the processor's cache, and that
+#: matrix products start no threads of their own.
+_TOGETHER = 1 << 13
 #: Values closer to each other than this count as equal: a flat scene must not be stretched by its rounding errors.
 _APART = 1e-6
 #: Colors are first clamped to this magnitude. Beyond it their order is irrelevant, and rotating them would lose digits.
@@ -212,11 +213,12 @@ def _rounds(source: Tensor, counts: Tensor, wanted: Tensor) -> list[tuple[Tensor
 
 def _through(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]]) -> Tensor:
     """Apply the maps of some rounds to colors [n, 3]; they are piecewise linear, and constant beyond their ends."""
+    moved = colors.numpy()
     for axes, maps in rounds:
-        along = zip((colors @ axes).unbind(1), maps, strict=True)
-        moved = [torch.from_numpy(np.interp(values.numpy(), *map_)) for values, map_ in along]
-        colors = torch.stack(moved, dim=1) @ axes.T
-    return colors
+        rotation = axes.numpy()
+        along = zip((moved @ rotation).T, maps, strict=True)
+        moved = np.stack([np.interp(values, *map_) for values, map_ in along], axis=1) @ rotation.T
+    return torch.from_numpy(moved)
 
 
 def _drawn(weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -71,7 +71,7 @@ def process_group(
     # which ranks that are left out could close.
     dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=patience)
     try:
-        yield ProcessGroupCollectives(dist.group.WORLD, device, timeout, sharing)
+        yield ProcessGroupCollectives(dist.group.WORLD, timeout, sharing)
     finally:
         dist.destroy_process_group()
 
@@ -144,17 +144,10 @@ class ProcessGroupCollectives(Collectives):
         gpu_sharing: Largest number of ranks of the job on one GPU; 1 without GPUs.
     """
 
-    def __init__(
-        self,
-        group: Any,
-        device: torch.device,
-        timeout: timedelta,
-        gpu_sharing: int = 1,
-    ) -> None:
+    def __init__(self, group: Any, timeout: timedelta, gpu_sharing: int = 1) -> None:
         self.rank = dist.get_rank(group)
         self.size = dist.get_world_size(group)
         self._group = group
-        self._device = device
         self.gpu_sharing = gpu_sharing
         self._timeout = timeout
         self._halves: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
@@ -316,7 +309,7 @@ class ProcessGroupCollectives(Collectives):
         group = dist.new_group(list(ranks), timeout=max(self._timeout, PREPARING))
         if self.rank not in ranks:
             return None
-        return ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing)
+        return ProcessGroupCollectives(group, self._timeout, self.gpu_sharing)
 
 
 def _machine() -> tuple[str, str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from api.cli.console import loss_text
@@ -15,7 +16,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.progress import percent
 from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, loss_over_time
-from sgsst_core.report.images import write_contact_sheet
+from sgsst_core.report.images import write_contact_sheet, write_grid
 from sgsst_core.report.page import relative_losses, render_page, round_length, running_mean
 from sgsst_core.scales import smoothed
 from sgsst_core.settings import make_settings
@@ -208,3 +209,9 @@ def test_contact_sheet_shows_the_stylized_views(
             sheets.append(np.asarray(image, dtype=np.float64))
     different = np.abs(sheets[0] - sheets[1]).max(axis=2) > 16
     assert 0.1 < different.mean() < 0.6, "the stylized views differ; style and original are the same"
+
+
+def test_long_names_of_views_are_shortened(tmp_path: Path) -> None:
+    write_grid(tmp_path / "s.jpg", [[("a\n" + "x" * 10**6, torch.zeros(4, 6, 3))]])
+    with Image.open(tmp_path / "s.jpg") as image:
+        assert image.width < 600
