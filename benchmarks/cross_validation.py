@@ -179,9 +179,9 @@ def inputs(data: Path, name: str, resolution: int) -> tuple[Scene, list[Camera],
     """Return a scene, the views of its runs, and the novel views between them that results are judged on."""
     if name == DEMO:
         with tempfile.TemporaryDirectory() as temporary:
-            ply, cameras, _ = build_demo(Path(temporary))
+            demo, cameras, _ = build_demo(Path(temporary))
             own = [resized(camera, resolution) for camera in load_cameras(cameras)]
-            return load_scene(ply).scene, own, spread([between(*each) for each in pairwise(own)], 6)
+            return load_scene(demo).scene, own, spread([between(*each) for each in pairwise(own)], 6)
     folder, (ply, source) = data / "scenes", SCENES[name]
     source = source if source.startswith("orbit:") else str(folder / source)
     scene = load_scene(folder / ply).scene

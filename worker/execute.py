@@ -327,14 +327,14 @@ def describe_scene(file: SceneFile) -> str:
 
 
 def _describe_views(job: Job) -> str:
-    views = job.stylizer.job.views
-    sizes = sorted({(camera.width, camera.height) for camera in views.cameras})
+    cameras = job.stylizer.job.views.cameras
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
     ends = dict.fromkeys(f"{width}x{height}" for width, height in (sizes[0], sizes[-1]))
     tiling = job.stylizer.job.loss.tiling
     scales = max(len(tiling.scales((height, width))) for width, height in sizes)
     content = "the photos" if job.request.images else "unstylized renders"
     plural = "s" if scales > 1 else ""
-    return f"{len(views)} of {' to '.join(ends)}, {scales} scale{plural}; content from {content}"
+    return f"{len(cameras)} of {' to '.join(ends)}, {scales} scale{plural}; content from {content}"
 
 
 def _describe_network(job: Job) -> str:

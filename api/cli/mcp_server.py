@@ -137,8 +137,8 @@ class Tools:
             target = self._new_file(out, [each.suffix for each in formats.RESULT_FORMATS])
             format = formats.format_of_name(target.name) if target else None
             name = await self._client.blend(job_id, weight, others, (format or PLY).name)
-            path = target and str(await self._client.download(job_id, target, name))
-        return {"url": self._address(job_id, name), "path": path}
+            path = await self._client.download(job_id, target, name) if target else None
+        return {"url": self._address(job_id, name), "path": str(path) if path else None}
 
     async def share(
         self,

@@ -111,8 +111,8 @@ class Metrics(Collector):
         for name, (text, label, known) in _COUNTERS.items():
             family = CounterMetricFamily(name, text, labels=[label] if label else None)
             values = stored[f"{name}_total"]
-            for value in sorted({*known, *values} if label else {""}):
-                family.add_metric([value] if label else [], values.get(value, 0.0))
+            for choice in sorted({*known, *values} if label else {""}):
+                family.add_metric([choice] if label else [], values.get(choice, 0.0))
             yield family
         for name, text in _HISTOGRAMS.items():
             buckets = stored[f"{name}_bucket"]

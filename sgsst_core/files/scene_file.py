@@ -421,7 +421,7 @@ class SceneColumns:
         Raises:
             SceneError: If invalid rows may not be dropped, or no valid rows remain.
         """
-        valid = (self.arrays["quats"] != 0).any(axis=1)
+        valid: NDArray[np.bool_] = (self.arrays["quats"] != 0).any(axis=1)
         for block in blocks(len(valid)):
             for array in self.arrays.values():
                 valid[block] &= np.isfinite(array[block]).reshape(block.stop - block.start, -1).all(axis=1)

@@ -311,7 +311,8 @@ def relative_losses(report: dict[str, Any]) -> dict[int, Floats]:
 def round_length(report: dict[str, Any]) -> int:
     """Return the number of steps in which every view is visited once."""
     views: int = report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"])
-    return max(1, math.ceil(views / report["settings"].get("views_per_step", 1)))
+    per_step: int = report["settings"].get("views_per_step", 1)
+    return max(1, math.ceil(views / per_step))
 
 
 def column(values: Sequence[float | None]) -> Floats:

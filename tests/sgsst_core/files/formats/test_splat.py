@@ -34,7 +34,7 @@ def test_truncated_file_and_flat_gaussian_are_refused(tmp_path: Path) -> None:
         tmp_path, SPLAT_ROW * 40 + bytes(5), "40 Gaussians of 32 bytes and 5 bytes more: it is truncated", "a.splat"
     )
     flat = struct.pack("<6f8B", 1, 2, 3, 0, 1, 1, 0, 255, 51, 128, 255, 128, 128, 128)
-    refused(tmp_path, SPLAT_ROW * 300 + flat, r"1 of 301 Gaussians hold .*scale_0 \(1 infinite\)", "a.splat")
+    refused(tmp_path, SPLAT_ROW * 300 + flat, r"1 of 301 Gaussians hold .*scale_0\.", "a.splat")
     loaded = read_scene(tmp_path / "a.splat", drop_invalid=True)
     assert (len(loaded.scene), loaded.dropped) == (300, 1)
 
@@ -104,7 +104,7 @@ def test_sections_of_different_sh_degree_are_read(tmp_path: Path) -> None:
 
 def test_standard_deviations_of_0_are_refused(tmp_path: Path) -> None:
     data = ksplat(scene(0, 100), 0)
-    refused(tmp_path, data[:5132] + bytes(4) + data[5136:], r"scale_0 \(1 infinite\)")
+    refused(tmp_path, data[:5132] + bytes(4) + data[5136:], r"scale_0\.")
 
 
 def changed(place: int, *values: int, level: int = 1) -> bytes:
