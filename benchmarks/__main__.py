@@ -33,9 +33,8 @@ COMMANDS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
         for text in (PLUSH, PLAYBOT, MASSA, MILLION, *OTHERS)
     ),
     ("job_parts", "", ("job_parts", *PLUSH_INPUTS, "--", "--resolution", "480")),
-    ("peak_memory", "", ("peak_memory",)),
     ("sos_gradient", "", ("sos_gradient",)),
-    ("large_views", "", ("large_views", *PLUSH_INPUTS, "--steps", "3")),
+    ("large_views", "", ("large_views", *PLUSH_INPUTS)),
     ("large_scene", "", ("large_scene",)),
     ("ranks", "", ("ranks", *PLUSH_INPUTS, "--memory", "20")),
     ("painting", "", ("painting", PLUSH, PLAYBOT, MASSA)),

@@ -25,7 +25,7 @@ from tests.api.page.browser import Watched, chromium, open_browser
 from tests.api.service import SETTINGS, Service
 
 #: Seconds that the command and the page are given.
-_COMMAND_WITHIN, _PAGE_WITHIN = 60, 600
+_COMMAND_WITHIN, _PAGE_WITHIN = 60, 180
 #: Steps after which strokes are clear in a preview: on Massa, the eye sees the first ones after 8.
 _STROKES = 12
 _POLL_SECONDS = 0.2

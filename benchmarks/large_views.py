@@ -1,6 +1,6 @@
 """Steps on a view of 5187x3361 pixels under a memory limit: seconds and peak memory, compared with the plan's bound.
 
-python -m benchmarks.large_views SCENE.ply CAMERAS STYLE [--steps 10] [--memory 10]
+python -m benchmarks.large_views SCENE.ply CAMERAS STYLE [--steps 2] [--memory 10]
 
 CAMERAS is a camera file, or orbit:N.
 """
@@ -22,7 +22,7 @@ SIZE = (5187, 3361)
 def main() -> None:
     """Measure, print and store. The first step prepares the view."""
     parser = input_parser(__doc__)
-    parser.add_argument("--steps", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=2)
     parser.add_argument("--memory", type=float, default=10.0, help="GB to plan with")
     arguments = parse(parser)
     scene, cameras, style = read_inputs(arguments, 1, SIZE[0])
