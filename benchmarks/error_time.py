@@ -186,11 +186,10 @@ def runs_of(rows: dict[str, Row]) -> Runs:
 
 def report(pairs: dict[str, Runs]) -> str:
     """Return tables of all pairs together and of each, the ways above the envelope, and when presets are overtaken."""
-    every = {way: [row for runs in pairs.values() for row in runs.get(way, [])] for way in WAYS}
     return "\n\n".join(
         [
-            table("mean over pairs", every),
-            *(table(pair, runs) for pair, runs in pairs.items()),
+            table("mean over pairs", list(pairs.values())),
+            *(table(pair, [runs]) for pair, runs in pairs.items()),
             *(
                 f"Above the envelope on {pair}: {way}; {other} is better."
                 for pair, runs in pairs.items()
@@ -206,18 +205,23 @@ def report(pairs: dict[str, Runs]) -> str:
     )
 
 
-def table(title: str, runs: Runs) -> str:
-    """Return a Markdown table of the means of each way's figures, with their ranges."""
+def table(title: str, pairs: Sequence[Runs]) -> str:
+    """Return a Markdown table of the means over pairs of each way's figures, with the range of all runs."""
     lines = [f"| {' | '.join([title, *(name for name, _ in COLUMNS.values())])} |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for way, rows in runs.items():
-        if rows:
-            cells = [_mean_and_range([row[key] for row in rows], digits) for key, (_, digits) in COLUMNS.items()]
+    for way in WAYS if len(pairs) > 1 else EVERY_WAY:
+        if runs := [each[way] for each in pairs if way in each]:
+            cells = [
+                _mean_and_range([[row[key] for row in rows] for rows in runs], digits)
+                for key, (_, digits) in COLUMNS.items()
+            ]
             lines.append(f"| {' | '.join([way, *cells])} |")
     return "\n".join(lines)
 
 
-def _mean_and_range(values: Sequence[float], digits: int) -> str:
-    low, mean, high = (f"{each(values):.{digits}f}" for each in (min, fmean, max))
+def _mean_and_range(values: Sequence[Sequence[float]], digits: int) -> str:
+    """Return the mean of several means, and the range of all values."""
+    every = [value for some in values for value in some]
+    low, mean, high = (f"{value:.{digits}f}" for value in (min(every), fmean(map(fmean, values)), max(every)))
     return mean if low == high else f"{mean} ({low} to {high})"
 
 
@@ -241,7 +245,7 @@ def overtaken(runs: Runs, preset: str, better: str) -> str:
     for row in runs[better]:
         factor = row["loss"] / row["curve"][-1][1]
         reached += [seconds for seconds, loss in row["curve"] if factor * loss <= left][:1]
-    return f"{_mean_and_range(reached, 0)} s" if len(reached) == len(runs[better]) else "its end"
+    return f"{_mean_and_range([reached], 0)} s" if len(reached) == len(runs[better]) else "its end"
 
 
 def write_figure(path: Path, pairs: dict[str, Runs]) -> None:

@@ -47,7 +47,7 @@ RUNS = runs_of(
 @pytest.mark.parametrize("document", ["README.md", "docs/performance.md"])
 def test_documents_show_the_stored_results(document: str) -> None:
     pairs = {pair: runs_of(rows) for pair, rows in stored().items()}
-    tables = [report(pairs).split("\n\n")[0], *(table(*each) for each in pairs.items())]
+    tables = [report(pairs).split("\n\n")[0], *(table(pair, [runs]) for pair, runs in pairs.items())]
     text = (ROOT / document).read_text()
     assert [each for each in tables[: 1 if document == "README.md" else None] if each not in text] == []
 
