@@ -136,7 +136,7 @@ def run(data: Path, pair: str, ways: Sequence[str], seeds: Sequence[int]) -> Non
         row |= {"views": job["cameras"]["count"], "sizes": job["cameras"]["sizes"]}
         row |= {"steps": len(job["history"]), "curve": curve(job) if way in BETTER.values() else None}
         add_pair("error_time", pair, description, {key: row}, presets=PRESETS, scenes={name: ply})
-        print(f"{pair}, {key}: {table(key, {way: [row]}).splitlines()[-1]}", flush=True)
+        print(f"{pair}, {key}: {table(key, [{way: [row]}]).splitlines()[-1]}", flush=True)
 
 
 def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:
