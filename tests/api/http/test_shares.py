@@ -366,5 +366,7 @@ def test_link_whose_files_hang_occupies_no_thread_of_others(
             path.rename(pipe)
             away.rename(path)
             writer = os.open(pipe, os.O_RDWR)
-        wait_for(lambda: visitor.get(f"/v1/shared/{token}").status_code == 200, "the link", service.said)
+        # A connection of its own, because the service may be closing those that have waited.
+        link = f"{service.url}/v1/shared/{token}"
+        wait_for(lambda: httpx2.get(link).status_code == 200, "the link", service.said)
         os.close(writer)
