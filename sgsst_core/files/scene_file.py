@@ -80,6 +80,8 @@ _FLOAT16_MAX = 65504.0
 _STANDARD = {name: (field, column) for field, names in PROPERTIES.items() for column, name in enumerate(names)} | {
     "opacity": ("opacities", 0)
 }
+#: Distance between positions, relative to a Gaussian's standard deviation, above which rounding moves it visibly.
+_COARSE = 4.0
 #: Names of arrays in notes.
 _TITLES = {"scales": "log scales", "sh_dc": "colors (f_dc)", "sh_rest": "spherical harmonics"}
 
@@ -206,7 +208,7 @@ def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY, axes: str =
 
 
 def losses(scene: Scene, format: SceneFormat) -> tuple[str, ...]:
-    """Return notes that count the Gaussians whose values a format clips."""
+    """Return notes that count the Gaussians whose values a format clips, or whose positions it makes coarse."""
     arrays, notes = arrays_of(scene), []
     scales = arrays["scales"].max(axis=1)  # a Gaussian that is thin in one axis looks the same
     for name, (low, high) in format.ranges.items():
@@ -215,6 +217,11 @@ def losses(scene: Scene, format: SceneFormat) -> tuple[str, ...]:
         if clipped:
             title = f"{_TITLES[name]} outside {low:.3g} to {high:.3g}, which {format.title} clips"
             notes.append(f"{clipped:,} of {len(scene):,} Gaussians have {title}")
+    if format.step is not None:
+        coarse = int((format.step(arrays["means"]) > _COARSE * np.exp(scales.astype(np.float64))).sum())
+        if coarse:
+            moved = f"{format.title} moves {coarse:,} of {len(scene):,} Gaussians"
+            notes.append(f"{moved} by up to more than their size, because others are far away")
     return tuple(notes)
 
 

@@ -626,7 +626,18 @@ def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     return np.concatenate(bounds_of, axis=1), np.stack(packed, axis=1)
 
 
+def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the largest distance between positions that can be stored in the chunk of each Gaussian, [n]."""
+    order = along_curve(means)
+    starts = np.arange(0, len(means), CHUNK_ROWS)
+    ends = (side.reduceat(means[order].astype(np.float64), starts) for side in (np.maximum, np.minimum))
+    steps = np.empty(len(means))
+    steps[order] = (np.subtract(*ends) / (2047, 1023, 2047)).max(axis=1)[np.arange(len(means)) // CHUNK_ROWS]
+    return steps
+
+
 COMPRESSED_PLY = SceneFormat(
     *("compressed.ply", "compressed PLY", 61, _matches_compressed, _read_compressed_header, _read, _write),
     ranges={"scales": (-_LARGEST_SCALE, _LARGEST_SCALE), "sh_rest": (-4.0, 4.0)},
+    step=_step,
 )

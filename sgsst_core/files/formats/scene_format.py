@@ -141,6 +141,8 @@ class SceneFormat:
             without path if it cannot represent the arrays. None if the format is only read.
         ranges: Lowest and highest value by the name of the array. That of "scales" holds for the largest of each
             Gaussian.
+        step: Distance between positions that can be stored, for positions [n, 3]: [n], or the same for all. None if
+            it is far below the size of a Gaussian.
         has_axes: Whether the writer takes axes as a fourth argument.
     """
 
@@ -153,6 +155,7 @@ class SceneFormat:
     write: Callable[..., None] | None = None
     media_type: str = "application/octet-stream"
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    step: Callable[[NDArray[np.float32]], NDArray[np.float64]] | None = None
     has_axes: bool = False
 
     @property

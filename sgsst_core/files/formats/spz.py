@@ -538,6 +538,7 @@ def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
 SPZ = SceneFormat(
     *("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write),
     ranges={"scales": (_SCALES[0], _SCALES[-1]), "sh_dc": (_COLORS[0], _COLORS[-1]), "sh_rest": (-1.0, 1.0)},
+    step=lambda means: np.ldexp(1.0, -_fractional_bits(means)),
     has_axes=True,
 )
 SPZ_3 = replace(

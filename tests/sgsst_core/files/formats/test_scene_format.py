@@ -524,6 +524,13 @@ def test_compressed_scene_renders_nearly_the_same(tmp_path: Path, format: SceneF
     }
 
 
+def far(scene: Scene) -> Scene:
+    """Return a scene with a large Gaussian far away, whose size SPZ can store."""
+    scene = replace(scene, means=scene.means.clone(), scales=scene.scales.clone())
+    scene.means[0], scene.scales[0] = 1e6, 5.0
+    return scene
+
+
 @pytest.mark.parametrize(
     ("change", "losing"),
     [
@@ -531,13 +538,14 @@ def test_compressed_scene_renders_nearly_the_same(tmp_path: Path, format: SceneF
         (lambda scene: replace(scene, scales=scene.scales - torch.tensor([12.0, 0, 0])), {}),  # thin in one axis
         (
             lambda scene: replace(scene, scales=scene.scales - 12),
-            {"SPZ": "scales outside -10 to 5.94"},
+            {"SPZ": "scales outside -10 to 5.94", "compressed": ""},
         ),
         (lambda scene: replace(scene, scales=scene.scales + 30), {"SPZ": "log scales", "compressed": "-20 to 20"}),
         (lambda scene: replace(scene, sh_dc=scene.sh_dc * 40), {"SPZ": "colors (f_dc) outside -3.33 to 3.33"}),
         (lambda scene: replace(scene, sh_rest=scene.sh_rest + 2), {"SPZ": "harmonics outside -1 to 1"}),
         (lambda scene: replace(scene, sh_rest=scene.sh_rest + 9), {"SPZ": "harmonics", "compressed": "-4 to 4"}),
         (lambda scene: replace(scene, scales=scene.scales + 99), {"SPZ": "", "compressed": "", "GLB": "-87 to 88"}),
+        (far, {"SPZ": "moves 615 of 616", "compressed": "moves"}),
     ],
 )
 def test_what_a_format_cannot_hold_is_counted(change: Callable[[Scene], Scene], losing: dict[str, str]) -> None:
