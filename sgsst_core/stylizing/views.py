@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import Cache, content_fraction
+from sgsst_core.budget import Cache
 from sgsst_core.devices import Timer
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import Color
@@ -295,7 +295,8 @@ class ViewTargets:
         self._maps = maps
         self._content_maps = content_maps
         has_maps = maps is not None or content_maps is not None
-        cached = int(memory * content_fraction(loss.network.device.type, weighted=weighted, has_maps=has_maps))
+        spares_coverage = loss.network.device.type != "cpu" and not weighted
+        cached = int(memory * (0.5 - 0.25 * has_maps + 0.25 * spares_coverage))
         images = cached // 2 if drawn else 0
         self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
         self._region_weights: Cache[tuple[int, bool], list[list[Tensor]]] = Cache(
