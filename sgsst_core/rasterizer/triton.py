@@ -45,7 +45,7 @@ class DeviceIntersections:
 
     Attributes:
         gaussians: [V] int64, indices into the scene, front to back.
-        values: [V, 8] float64, see `cpu.Column`.
+        values: [V, 8] float64, see `cpu.Projection`.
         starts: [tiles + 1] int64, first entry of each tile.
         ranks: [E] int32, rank (index into `gaussians`) of each entry, front to back within a tile.
         slots: [E] int32, slot of each entry; the slots of one Gaussian are contiguous.
