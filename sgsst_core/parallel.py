@@ -159,11 +159,6 @@ class Team:
         self.groups = math.gcd(settings.views_per_step, collectives.size)
         self.group = collectives.split_group(self.groups)
 
-    def expect(self, seconds: float) -> None:
-        """Set the timeouts of the ranks for steps that take so many seconds."""
-        for ranks in (self.everybody, self.group):
-            ranks.set_timeout_for(seconds)
-
     @property
     def own_group(self) -> int:
         """Index of this rank's group."""

@@ -133,7 +133,8 @@ class _Pace:
         self._stylizer, self._estimate, self._first = stylizer, estimate(stylizer.job), len(stylizer.history)
         self._earlier, self.beside = stylizer.seconds, 0.0
         self._started = time.perf_counter(), time.process_time()
-        stylizer.job.team.expect(self._estimate.seconds)
+        for ranks in (stylizer.job.team.everybody, stylizer.job.team.group):
+            ranks.set_timeout_for(self._estimate.seconds)
 
     def step_seconds(self, *, coarse: bool = False, least: int = _KNOWN) -> float:
         """Return the seconds of a mean step of a phase, with what happens between steps.
