@@ -302,7 +302,10 @@ class ViewTargets:
         self._region_weights: Cache[tuple[int, bool], list[list[Tensor]]] = Cache(
             memory // 4 if has_maps else 0, lambda every: sum(map(_pyramid_bytes, every))
         )
-        self._images: Cache[_ContentKey, ScaledView] = Cache(images, _image_bytes)
+        # Whole scaled views count, so that all ranks agree on what fits.
+        self._images: Cache[_ContentKey, ScaledView] = Cache(
+            images, lambda view: view.size[0] * view.size[1] * 3 * view.image.itemsize
+        )
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
         self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
 
@@ -427,11 +430,6 @@ class ViewTargets:
 
 #: Index of the view, scale, and every rank's pieces of it.
 _ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
-
-
-def _image_bytes(view: ScaledView) -> int:
-    """Return the size in bytes of a whole scaled view, which all ranks agree on."""
-    return view.size[0] * view.size[1] * 3 * view.image.itemsize
 
 
 def _pyramid_bytes(pyramid: list[Tensor]) -> int:
