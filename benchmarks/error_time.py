@@ -36,7 +36,6 @@ from sgsst_core.report.images import color_of
 from sgsst_core.report.page import (
     column,
     draw_legend,
-    draw_points,
     png_chart,
     round_length,
     running_mean,
@@ -274,7 +273,8 @@ def _draw(axes: Axes, runs: Runs, key: str) -> None:
     for index, (label, ways) in enumerate(lines.items()):
         own = [runs[way] for way in ways if way in runs]
         x, y = (column([fmean(row[name] for row in rows) for rows in own]) for name in ("seconds", key))
-        draw_points(axes, x, y, marker="osD^"[index], color=color_of(index), label=label)
+        if len(x):  # matplotlib's layout would extend an empty, unclipped line to the corner of the figure
+            axes.plot(x, y, clip_on=False, marker="osD^"[index], color=color_of(index), label=label)
         low, high = ([each(row[key] for row in rows) for rows in own] for each in (min, max))
         axes.vlines(x, low, high, color=color_of(index), linewidth=1)
     every = [row for rows in runs.values() for row in rows]

@@ -39,19 +39,6 @@ def memory_for(use: MemoryUse, memory: int) -> int:
     return int(memory * _FRACTIONS[use])
 
 
-def content_fraction(device: str, *, weighted: bool, has_maps: bool) -> float:
-    """Return the fraction of the memory for data of views that content may use.
-
-    A quarter is for colors, one for coverage and one for region maps. On a GPU, content also uses the quarter for
-    coverage if there are no position weights.
-
-    Args:
-        device: "cpu" or "cuda".
-        weighted: Whether statistics are weighted by rendered coverage.
-    """
-    return 0.5 - 0.25 * has_maps + 0.25 * (device != "cpu" and not weighted)
-
-
 def default_memory_limit(device: torch.device | None = None) -> int:
     """Return the default memory budget of a job in bytes, given the memory that is free now.
 
@@ -150,10 +137,6 @@ class Cache(Generic[K, V]):
                     self.sizes[key] = size
                     self._store(key, make(), size)
                 self._decided.add(key)
-
-    def __contains__(self, key: K) -> bool:
-        """Return whether the value of a key is cached, so it need not be computed."""
-        return key in self.values
 
     def has_space(self, size: int) -> bool:
         """Return whether a value of `size` bytes would still fit."""

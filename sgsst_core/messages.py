@@ -115,7 +115,10 @@ def from_json(value: Any, tensors: dict[str, Tensor]) -> Any:
         case "array":
             return tensors[content].numpy()
         case "error":
-            return _error(content[0])(*each(content[1]))
+            error = _class(content[0])
+            if not issubclass(error, SgsstError):
+                raise ValueError(f"{content[0]} is not an error of this program")
+            return error(*each(content[1]))
         case "object":
             return _object(content[0], {name: from_json(member, tensors) for name, member in content[1].items()})
     raise ValueError(f"unknown kind {kind!r}")
@@ -130,13 +133,6 @@ def _object(name: str, members: dict[str, Any]) -> Any:
     for member, value in members.items():
         object.__setattr__(instance, member, value)  # works for frozen dataclasses, too
     return instance
-
-
-def _error(name: str) -> type[SgsstError]:
-    kind = _class(name)
-    if not issubclass(kind, SgsstError):
-        raise ValueError(f"{name} is not an error of this program")
-    return kind
 
 
 def _name_of(kind: type) -> str:

@@ -159,11 +159,6 @@ class Team:
         self.groups = math.gcd(settings.views_per_step, collectives.size)
         self.group = collectives.split_group(self.groups)
 
-    def expect(self, seconds: float) -> None:
-        """Set the timeouts of the ranks for steps that take so many seconds."""
-        for ranks in (self.everybody, self.group):
-            ranks.set_timeout_for(seconds)
-
     @property
     def own_group(self) -> int:
         """Index of this rank's group."""
@@ -414,13 +409,9 @@ class Tiling:
     largest: int | None = None
     rendering: float = 0.0
 
-    def scale_count(self, size: Size) -> int:
-        """Return n_s for views of a size (height, width)."""
-        return scale_count(*size, self.coarsest)
-
     def scales(self, size: Size) -> list[int]:
         """Return the scales with a positive weight for views of a size (height, width), finest first."""
-        return self.weights.chosen(self.scale_count(size))
+        return self.weights.chosen(scale_count(*size, self.coarsest))
 
     def tiles(self, size: Size, region: Rectangle | None = None) -> list[PartitionTile]:
         """Return the tiles of a region of a scaled view of size (height, width).
@@ -481,12 +472,15 @@ class Divider:
                 read, which avoids synchronizing with the device. The pieces of coarser scales may then be a few cells
                 larger.
         """
-        read = coverage if region is None else None
-        weights = {scale: read[scale] if read else None for scale in sizes}
-        if region is None:
-            pieces = tuple(self._piece(scale, size, weights[scale]) for scale, size in sizes.items())
-        else:
-            pieces = tuple(Piece(scale, size, scaled_region(region, scale, size)) for scale, size in sizes.items())
+        weights = {scale: coverage[scale] if coverage and region is None else None for scale in sizes}
+
+        def needed(scale: int, size: Size) -> Rectangle:
+            if region is not None:
+                return scaled_region(region, scale, size)
+            own = weights[scale]
+            return Rectangle(0, 0, *size) if own is None else covered_region(own)
+
+        pieces = tuple(Piece(scale, size, needed(scale, size)) for scale, size in sizes.items())
         return self._division(divide(pieces, self.tiling.halo, self.collectives.size), sizes, weights)
 
     def divide_view(
@@ -538,12 +532,6 @@ class Divider:
                 for scale in sizes
             },
         )
-
-    def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
-        """Return the piece of one scale that contains all pixels that the network has to process."""
-        if coverage is None:
-            return Piece(scale, size, Rectangle(0, 0, *size))
-        return Piece(scale, size, covered_region(coverage))
 
     def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
         """Return the covered partition tiles of a piece, as large as the memory budget allows."""

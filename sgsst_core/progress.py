@@ -87,8 +87,9 @@ class Progress(BaseModel):
     @property
     def note(self) -> str:
         """Return the loss and the remaining time as text; empty if both are unknown."""
-        loss = self.mean_loss or self.loss
-        return ", ".join(filter(None, ("" if loss is None else f"loss {loss:.3g}", time_left(self.eta_s))))
+        loss, left = self.mean_loss or self.loss, self.eta_s
+        time_left = "" if left is None else f"{clock(left)} left" if left >= 1 else "almost done"
+        return ", ".join(filter(None, ("" if loss is None else f"loss {loss:.3g}", time_left)))
 
     def text(self, title: str | None = None) -> str:
         """Return the progress as a line, which starts with the stage or the `title` of it."""
@@ -175,13 +176,6 @@ def byte_count(count: float | None) -> str:
     return f"{count:.0f}{_GAP}bytes"
 
 
-def time_left(seconds: float | None) -> str:
-    """Return the remaining time of a stage as text; empty if it is unknown."""
-    if seconds is None:
-        return ""
-    return f"{clock(seconds)} left" if seconds >= 1 else "almost done"
-
-
 def clock(seconds: float) -> str:
     """Return a duration as minutes and seconds, or hours, minutes and seconds."""
     minutes, rest = divmod(round(seconds), 60)
@@ -209,11 +203,6 @@ def live_bar(console: Console, *columns: ProgressColumn, enabled: bool = True) -
     return rich.progress.Progress(*columns, console=console, transient=True, disable=not (enabled and live))
 
 
-def set_total(bar: rich.progress.Progress, total: float | None) -> None:
-    """Set the total of a bar's only task; None if it is unknown, which `Progress.update` would ignore."""
-    bar.tasks[0].total = total
-
-
 class JobBar:
     """Progress of a job, from reading the scene to the last step; see `job_bar`."""
 
@@ -227,7 +216,7 @@ class JobBar:
         """Show the stage, and how many of its views or steps are completed."""
         title = _TITLES.get(progress.stage, progress.stage)
         _, done, total = progress.completed
-        set_total(self._bar, total or None)
+        self._bar.tasks[0].total = total or None  # `update` would ignore None
         self._bar.update(self._task, description=title, completed=done, note=progress.note)
         if self._bar.disable and time.monotonic() - self._last_line >= LOG_SECONDS:
             self._last_line = time.monotonic()

@@ -348,8 +348,8 @@ def choose_pieces(
 def refine_decision(refinement: Refinement, settings: Settings) -> Decision:
     """Return the plan's line about split Gaussians."""
     before, item = len(refinement.pieces), "refined Gaussians"
-    back = f"; {refinement.reverted:,} are not split, because their parts would change the image"
-    back = back if refinement.reverted else ""
+    left_whole = f"; {refinement.reverted:,} are not split, because their parts would change the image"
+    back = left_whole if refinement.reverted else ""
     if not refinement.split or refinement.psnr is None:
         return Decision(item, "none is split", f"none is large where the gradient calls for several colors{back}")
     budget = "are allowed" if settings.refine == "auto" else "were requested"

@@ -263,7 +263,8 @@ def write_page(
     }
     about = json.dumps(facts).replace("<", "\\u003c")
     values = {"title": html.escape(title), "style": viewer["style"], "about": about}
-    values |= {name: _base85(content) for name, content in data.items()}
+    # "<", which would end a script element, becomes a comma.
+    values |= {name: base64.b85encode(each, pad=True).decode().replace("<", ",") for name, each in data.items()}
     page = re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], viewer["document"])
     with _written(out, in_place=in_place) as path:
         path.write_text(page, encoding="utf-8")
@@ -337,11 +338,6 @@ def _indexed_colors(scene: Scene, out: Path) -> bytes:
         with Image.open(archive.open(meta["sh0"]["files"][0])) as image:
             indices = np.asarray(image.convert("RGBA")).reshape(-1, 4)[: meta["count"], :3]
     return np.array(meta["sh0"]["codebook"], "<f2").tobytes() + indices.tobytes()
-
-
-def _base85(data: bytes) -> str:
-    """Encode bytes so that they can stand in a script element: "<", which would end it, becomes a comma."""
-    return base64.b85encode(data, pad=True).decode().replace("<", ",")
 
 
 @dataclass(frozen=True)

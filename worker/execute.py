@@ -299,11 +299,10 @@ class Prepared:
 def describe(job: Job) -> Prepared:
     """Summarize the inputs and the plan for the user."""
     stylizer, settings = job.stylizer, job.stylizer.job.settings
-    lines = [
-        ("scene", describe_scene(job.scene_file)),
-        ("views", _describe_views(job)),
-        ("network", _describe_network(job)),
-    ]
+    network = job.sources.backbone.name.upper()
+    if job.request.backbone == "auto" and network == "VGG16":
+        network += ", because VGG19 (the paper's) is not installed; install it with `sgsst weights fetch vgg19`"
+    lines = [("scene", describe_scene(job.scene_file)), ("views", _describe_views(job)), ("network", network)]
     lines += [(decision.item, f"{decision.decision}: {decision.reason}") for decision in stylizer.job.plan.decisions]
     rates = f"learning rate {settings.learning_rate:g} to {settings.learning_rate_end:g}"
     steps = f"{stylizer.job.plan.steps_coarse} steps on the coarsest scale, then {settings.steps_sos} on all"
@@ -335,13 +334,6 @@ def _describe_views(job: Job) -> str:
     content = "the photos" if job.request.images else "unstylized renders"
     plural = "s" if scales > 1 else ""
     return f"{len(cameras)} of {' to '.join(ends)}, {scales} scale{plural}; content from {content}"
-
-
-def _describe_network(job: Job) -> str:
-    name = job.sources.backbone.name.upper()
-    if job.request.backbone == "auto" and name == "VGG16":
-        return f"{name}, because VGG19 (the paper's) is not installed; install it with `sgsst weights fetch vgg19`"
-    return name
 
 
 # --- steps and outputs ------------------------------------------------------------------------------------------------

@@ -174,7 +174,10 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
         scene_file = together(collectives, read).rendered(source.render_mode, source.eps2d)
     with errors_of("cameras"):
         check_choice(source)
-        capture = _capture_on_all_ranks(request, scene_file, collectives).fitted(settings)
+        read_views = partial(read_job_capture, request, scene_file)
+        # Every rank reads a camera file itself. Only rank 0 computes an orbit, since processors may round differently.
+        capture = collectives.broadcast(read_views) if source.cameras is None else together(collectives, read_views)
+        capture = capture.fitted(settings)
         cameras = capture.cameras
         if limits:
             limits.check_cameras(cameras)
@@ -253,7 +256,7 @@ def fingerprint_of(inputs: Inputs, settings: Settings, weights: str, collectives
         SettingsError: If ranks have read different files.
     """
     photos = inputs.photos
-    stamps = collectives.broadcast(lambda: repr([_stamp(photo) for photo in photos]) if photos else "")
+    stamps = collectives.broadcast(lambda: repr([*map(_stamp, photos)]) if photos else "")
     own = fingerprint(inputs.scene_file.scene, inputs.cameras, inputs.style, settings, weights, stamps, inputs.regions)
     fingerprints = collectives.all_gather((own, socket.gethostname()))
     for other, host in fingerprints:
@@ -307,15 +310,6 @@ def load_styles(files: Sequence[StyleFile], background: Color = WHITE) -> Style:
     notes = [_REDUCED.format(file.path.name) for file, size in zip(files, sizes, strict=True) if size > most]
     images = tuple(load_image(file.path, background=background, warn=notes.append, max_pixels=most) for file in files)
     return Style(images, weights, tuple(file.path.name for file in files), tuple(notes))
-
-
-def _capture_on_all_ranks(request: JobSpec, file: SceneFile, collectives: Collectives) -> Capture:
-    """Return the result of `read_job_capture`, the same on every rank.
-
-    Every rank reads a camera file itself. Only rank 0 computes an orbit, since processors may round differently.
-    """
-    read = partial(read_job_capture, request, file)
-    return collectives.broadcast(read) if request.source.cameras is None else together(collectives, read)
 
 
 def read_job_capture(request: JobSpec, file: SceneFile) -> Capture:

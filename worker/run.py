@@ -487,10 +487,7 @@ def _failure(error: BaseException) -> Outcome:
         pickle.loads(pickle.dumps(sent))
     except Exception:  # the error cannot be pickled, so only its text is sent
         sent = RuntimeError(f"{type(error).__name__}: {error}")
-    return Outcome(error=sent, trace=trace, echo=_raised_in_exchange(error))
-
-
-def _raised_in_exchange(error: BaseException) -> bool:
-    """Return whether an error was raised inside torch.distributed, including its store."""
-    frames = [frame.f_globals.get("__name__") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return any(str(name).startswith("torch.distributed") for name in (type(error).__module__, *frames))
+    modules = [frame.f_globals.get("__name__") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    # An exchange between ranks raises inside torch.distributed, including its store.
+    echo = any(str(name).startswith("torch.distributed") for name in (type(error).__module__, *modules))
+    return Outcome(error=sent, trace=trace, echo=echo)

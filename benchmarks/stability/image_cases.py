@@ -20,7 +20,7 @@ from benchmarks.stability.case import (
     texture,
     vgg16,
 )
-from benchmarks.stability.sos_reference import layer_statistics_reference, style_loss_reference
+from benchmarks.stability.sos_reference import applied, layer_statistics_reference, style_loss_reference
 from sgsst_core.features.statistics import layer_statistics
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
@@ -143,7 +143,7 @@ def _dead(where: str, full: bool) -> CaseResult:
             features[..., 3:6] = 123.4
     target = LayerTarget.of(layer_statistics(style))
     _, gradient = style_loss(layer_statistics(view), target)
-    actual = gradient.apply(view)
+    actual = applied(gradient, view)
     exact = _autograd(view, LayerTarget.of(layer_statistics_reference(style)))
     published = (layer_statistics(view).std() - target.std) / layer_statistics(view).std()
     broken = int((~torch.isfinite(published)).sum())
@@ -176,7 +176,7 @@ def _steep(full: bool) -> CaseResult:
     )
     target = LayerTarget.of(layer_statistics(style))
     _, gradient = style_loss(layer_statistics(view), target)
-    return CaseResult(_relative(gradient.apply(view), _autograd(view, target)), 1e-4)
+    return CaseResult(_relative(applied(gradient, view), _autograd(view, target)), 1e-4)
 
 
 def _autograd(features: Tensor, target: LayerTarget) -> Tensor:

@@ -51,7 +51,7 @@ from sgsst_core.loss.terms import nearest_weight
 from sgsst_core.parallel import ALONE, Collectives
 from sgsst_core.scales import scale_count
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.colors import luminance
+from sgsst_core.scene.colors import color_subspace_of, luminance
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.job import in_bfloat16
@@ -203,7 +203,7 @@ def _moved(job: Stylizer, start: Tensor) -> float:
     """Return the largest change of a coefficient, ignoring the clamping of initial colors to their bounds."""
     sh_dc = job.sh_dc.detach()
     chroma_of = start if job.job.settings.preserve_colors == "luminance" else None
-    subspace = job.job.styles.color_subspace(job.job.settings)
+    subspace = color_subspace_of(job.job.styles.all, job.job.settings)
     within = constrained(start, chroma_of, subspace, bounded=job.job.settings.bounded)
     return float(torch.minimum((sh_dc - start).abs(), (sh_dc - within).abs()).max())
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from benchmarks.stability.case import Case, CaseResult, texture, vgg16
-from benchmarks.stability.sos_reference import layer_statistics_reference
+from benchmarks.stability.sos_reference import applied, layer_statistics_reference
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
@@ -73,7 +73,7 @@ def _agreement(features: torch.Tensor, parts: dict[str, list[LayerStatistics]], 
     """Return the largest difference of loss and feature gradient between ways to sum up statistics of one layer."""
     results = {name: style_loss(reduce(merge, statistics), target) for name, statistics in parts.items()}
     losses = [float(terms.sum()) for terms, _ in results.values()]
-    gradients = [gradient.apply(features) for _, gradient in results.values()]
+    gradients = [applied(gradient, features) for _, gradient in results.values()]
     error = max(abs(loss / losses[0] - 1) for loss in losses)
     off = max(float((gradient - gradients[0]).norm() / gradients[0].norm()) for gradient in gradients)
     # The loss has the narrower bound, so its error is scaled to the common one.

@@ -16,6 +16,7 @@ from sgsst_core.features.vgg import CONTENT_LAYER, PIXEL_UNIT, PIXELS, layer_str
 from sgsst_core.loss.terms import (
     PAPERS_WEIGHTS,
     LayerTarget,
+    StyleGradient,
     TermWeights,
     nearest_layers,
     nearest_weight,
@@ -36,6 +37,13 @@ def layer_statistics_reference(features: Tensor, position_weights: Tensor | None
     mean = (a[:, None] * flat).sum(0) / count
     centered = (flat - mean) * a[:, None].sqrt()
     return LayerStatistics(count, mean, centered.T @ centered)
+
+
+def applied(gradient: StyleGradient, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
+    """Return dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
+    result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)
+    gradient.add_to(result, features, position_weights)
+    return result
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,9 @@ from sgsst_core.features.weight_files import cache_folder, damage_of
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel import ALONE
-from sgsst_core.planning.plan import choose_precision, describe_machine, gpu_problems
+from sgsst_core.planning.plan import choose_precision, describe_machine, rasterizer_problem
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer, rasterizer_for
+from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
@@ -126,12 +127,12 @@ def _memory(device: torch.device) -> Diagnosis:
 
 def _rasterizer(*, gpu: bool) -> tuple[str, Diagnosis]:
     """Return the rasterizer of jobs on this machine, and the finding about it."""
-    problems = gpu_problems(ALONE) if gpu else {}
-    name = rasterizer_for("cuda" if gpu else "cpu", problems)
-    texts = [f"{RASTERIZERS[each].title} cannot be used: {problem}" for each, problem in problems.items()]
-    used = RASTERIZERS[name]
-    title = f"{used.title} works here" if used.on_gpu else "views are rendered on the CPU"
-    return name, Diagnosis("rasterizer", "warning" if gpu and not used.on_gpu else "works", "; ".join([title, *texts]))
+    problem = rasterizer_problem(ALONE, TritonRasterizer.name) if gpu else None
+    name = rasterizer_for("cuda" if gpu else "cpu", problem)
+    text = f"{RASTERIZERS[name].title} works here" if RASTERIZERS[name].on_gpu else "views are rendered on the CPU"
+    if problem:
+        text += f"; {TritonRasterizer.title} cannot be used: {problem}"
+    return name, Diagnosis("rasterizer", "warning" if problem else "works", text)
 
 
 def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:

@@ -33,7 +33,6 @@ from sgsst_core.report.page import (
     Floats,
     column,
     draw_legend,
-    draw_points,
     joined,
     png_chart,
     scale_name,
@@ -322,8 +321,16 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str) -> Floats:
     seconds = [column([point.seconds for point in curve.points]) for curve in curves]
     values = [column([_measures(point).get(title) for point in curve.points]) for curve in curves]
     for index, curve in enumerate(curves):
-        options = {"marker": _MARKERS[index % len(_MARKERS)], "color": color_of(index), "label": curve.variant.name}
-        draw_points(axes, seconds[index], values[index], markersize=4, linewidth=1, **options)
+        axes.plot(
+            seconds[index],
+            values[index],
+            marker=_MARKERS[index % len(_MARKERS)],
+            markersize=4,
+            linewidth=1,
+            color=color_of(index),
+            label=curve.variant.name,
+            clip_on=False,
+        )
     set_log_x(axes, joined(seconds), "seconds of optimization")
     axes.set_title(title)
     return joined(values)

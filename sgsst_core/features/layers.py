@@ -45,8 +45,7 @@ def max_pool(source: Tensor) -> Tensor:
     if has_pooling_kernel(source):
         return fused_max_pool(source)
     if not _is_compiled_for(source):
-        pooled: Tensor = F.max_pool2d(source, 2, return_indices=True)[0]
-        return pooled
+        return F.max_pool2d(source, 2, return_indices=True)[0]
     _, channels, height, width = source.shape
     out = source.new_empty((height // 2, width // 2, channels))
     with kernel_threads():

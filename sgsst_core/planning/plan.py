@@ -7,7 +7,7 @@ read to find the facts. Thresholds were measured once; what they rest on stands 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -67,7 +67,7 @@ class Machine:
         sharing: Maximum number of ranks that share one machine's memory, or that of a GPU.
         precisions: Precisions other than float32 that the processors of all ranks compute without emulation.
         graphs: Whether CUDA graphs can be used: on NVIDIA GPUs, with a PyTorch that survives a failed capture.
-        problems: Reason by name for each GPU rasterizer that does not work; empty on the CPU.
+        problem: Reason why the GPU's rasterizer does not work; None if it works, and on the CPU.
     """
 
     device: Device
@@ -76,7 +76,7 @@ class Machine:
     ranks: int = 1
     precisions: tuple[PlannedPrecision, ...] = ()
     graphs: bool = False
-    problems: Mapping[str, str] = field(default_factory=dict)
+    problem: str | None = None
 
     @property
     def memory(self) -> int:
@@ -206,7 +206,7 @@ def equip(
     """
     scene = scene.attenuated(settings.sh_attenuation)
     machine = describe_machine(settings, collectives)
-    name = rasterizer or rasterizer_for(machine.device, machine.problems)
+    name = rasterizer or rasterizer_for(machine.device, machine.problem)
     memory = memory_for("rasterizer", machine.memory)
     of_scene = make_rasterizer(name, scene, background=settings.background, near=settings.near, memory=memory)
     return PlanningContext(scene, tuple(cameras), settings, machine, weights, of_scene)
@@ -231,7 +231,7 @@ def describe_machine(settings: Settings, collectives: Collectives) -> Machine:
         ranks=collectives.size,
         precisions=tuple(name for name in has if all(own[name] for _, own, _ in everywhere)),
         graphs=all(own for _, _, own in everywhere),
-        problems=gpu_problems(collectives) if device == "cuda" else {},
+        problem=rasterizer_problem(collectives, TritonRasterizer.name) if device == "cuda" else None,
     )
 
 
@@ -262,12 +262,6 @@ def count_intersections(rasterizer: Rasterizer, views: int) -> int:
 def common_device(collectives: Collectives) -> Device:
     """Return the device that is available on all ranks."""
     return "cuda" if all(collectives.all_gather(torch.cuda.is_available())) else "cpu"
-
-
-def gpu_problems(collectives: Collectives) -> dict[str, str]:
-    """Return the problem of the GPU rasterizer by its name, if it does not work on some rank."""
-    problem = rasterizer_problem(collectives, TritonRasterizer.name)
-    return {} if problem is None else {TritonRasterizer.name: problem}
 
 
 def rasterizer_problem(collectives: Collectives, name: str) -> str | None:
@@ -759,10 +753,10 @@ def _about_rasterizer(plan: Plan, facts: Facts) -> Iterator[Decision]:
     """Yield the decisions about the rasterizer and kernel launches on a GPU; on the CPU there is no choice."""
     if plan.device != "cuda":
         return
-    problems, used = facts.machine.problems.items(), RASTERIZERS[facts.rasterizer]
-    reasons = [f"{RASTERIZERS[name].title} cannot be used: {problem}" for name, problem in problems]
+    problem, used = facts.machine.problem, RASTERIZERS[facts.rasterizer]
     device = "GPU" if used.on_gpu else "CPU"
-    yield Decision("rasterizer", f"{used.title} on the {device}", "; ".join(reasons) or "it works here")
+    why = f"{TritonRasterizer.title} cannot be used: {problem}" if problem else "it works here"
+    yield Decision("rasterizer", f"{used.title} on the {device}", why)
     launches = "the loss of a view is captured as a CUDA graph" if plan.graphs else "kernel by kernel"
     reason = (
         f"graphs, with NVIDIA GPUs and PyTorch 2.13, are for views of at most {_GRAPH_PIXELS / 1e6:.1f} megapixels, "

@@ -78,7 +78,7 @@ def survey_views(
 
     Args:
         show: Callback, called before the first view of this rank and after each view.
-        visit: Callback for the camera of each view of this rank that sees anything, and its blend weights [N].
+        visit: Callback for each view of this rank that sees anything: its camera, and blend weights [N] on the CPU.
 
     Raises:
         CameraError: If no camera sees a Gaussian.
@@ -96,7 +96,7 @@ def survey_views(
             if seen:
                 weights += summed.double()
                 if visit:
-                    visit(cameras[index], summed)
+                    visit(cameras[index], summed.cpu())
     for others in collectives.all_gather(views):
         views |= others
     pixels = [camera.width * camera.height for camera in cameras]

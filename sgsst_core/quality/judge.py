@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
 from statistics import fmean
@@ -36,7 +36,7 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.colors import luminance, resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.style import Moments, Style, color_moments, square_root, style_moments
 from sgsst_core.stylizing.styles import JobStyles
 
@@ -114,13 +114,13 @@ class Judge:
         cameras: Sequence[Camera],
         background: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        self.scene = scene
+        device = rasterizer.device
+        self.scene = replace(scene, means=scene.means.to(device), sh_rest=scene.sh_rest.to(device))
         self._lpips, self._rasterizer = lpips, rasterizer
         styles = style if isinstance(style, JobStyles) else JobStyles(Style.of(style))
         self._judges = [_StyleJudge(lpips, each) for each in styles.each or (styles.own,)]
         self._maps = styles.maps(rasterizer)
         self._background = torch.tensor(background, dtype=rasterizer.dtype, device=rasterizer.device)
-        self._sh_rest, self._means = scene.sh_rest.to(rasterizer.device), scene.means.to(rasterizer.device)
         self.cameras = []
         for camera in (resized(camera, min(JUDGED_SIDE, camera.side)) for camera in cameras):
             if min(camera.width, camera.height) >= MIN_SIDE:
@@ -176,10 +176,8 @@ class Judge:
 
     def _render(self, sh_dc: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return the image [H, W, 3] over the rasterizer's background, and the coverage [H, W]."""
-        rest = torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device)
-        if self.scene.sh_degree:
-            rest = rest_colors(self._sh_rest, self._means, camera)
-        return self._rasterizer.render(view_colors(sh_dc, rest), camera), self._rasterizer.coverage(camera)
+        colors = scene_colors(replace(self.scene, sh_dc=sh_dc), camera, self._rasterizer.device)
+        return self._rasterizer.render(colors, camera), self._rasterizer.coverage(camera)
 
     def _on(self, image: Tensor, coverage: Tensor, camera: Camera, level: float) -> Tensor:
         """Return the image on another background color, clamped to 0 to 1."""

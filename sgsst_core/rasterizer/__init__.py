@@ -5,7 +5,6 @@ To add one, implement `base.Rasterizer` in a module and list the class in `RASTE
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import Any
 
 import torch
@@ -65,15 +64,14 @@ def make_rasterizer(
     return kind(scene, background=background, near=near, device=device, **options)
 
 
-def rasterizer_for(device: str, unusable: Collection[str]) -> str:
+def rasterizer_for(device: str, problem: str | None) -> str:
     """Return the name of the rasterizer that computes blend weights: on a GPU `triton`, if it works.
 
     Args:
         device: Type of the job's device, "cpu" or "cuda".
-        unusable: Names of GPU rasterizers that do not work.
+        problem: Reason why `triton` does not work; None if it works.
     """
-    on_gpu = torch.device(device).type != "cpu" and TritonRasterizer.name not in unusable
-    return TritonRasterizer.name if on_gpu else CpuRasterizer.name
+    return TritonRasterizer.name if torch.device(device).type != "cpu" and problem is None else CpuRasterizer.name
 
 
 def drawing_problem(name: str, device: torch.device | str = "cuda") -> str | None:

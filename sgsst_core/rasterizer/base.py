@@ -159,9 +159,8 @@ class Rasterizer(ABC):
         """
         raise NotImplementedError(f"rasterizer {self.name!r} cannot cache the blend weights of {camera.name!r}")
 
-    def cache_weights(self, camera: Camera) -> bool:
-        """Cache a view's weights if possible, and return whether they are cached."""
-        return False
+    def cache_weights(self, camera: Camera) -> None:
+        """Cache a view's weights if possible."""
 
     def release_view(self, camera: Camera, budget: int) -> None:
         """Drop the prepared data of a view whose weights are now cached; limit that of all others to `budget` bytes.

@@ -30,7 +30,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numba
@@ -54,29 +53,15 @@ _ROUNDING = 1e-6
 _CHUNKS = 16
 
 
-class Column(IntEnum):
-    """Columns of `Projection.values`; dx, dy are the offsets of a pixel center from (X, Y) in pixels.
-
-    alpha = 2^(LOG2_OPACITY - u^2 - w^2) with w = dy * W_SCALE, u = (dx - SKEW * dy) * U_SCALE.
-    """
-
-    X = 0
-    Y = 1
-    SKEW = 2
-    U_SCALE = 3
-    W_SCALE = 4
-    LOG2_OPACITY = 5
-    EXTENT_X = 6
-    EXTENT_Y = 7
-
-
 @dataclass(frozen=True)
 class Projection:
     """Gaussians of a scene that can be visible in a view, front to back.
 
     Attributes:
         gaussians: [V] int32, indices into the scene, sorted by depth along the viewing axis and then by index.
-        values: [V, 8] float64, see `Column`.
+        values: [V, 8] float64: X, Y, SKEW, U_SCALE, W_SCALE, LOG2_OPACITY, EXTENT_X and EXTENT_Y. With offsets dx, dy
+            of a pixel center from (X, Y) in pixels, alpha = 2^(LOG2_OPACITY - u^2 - w^2), where w = dy * W_SCALE and
+            u = (dx - SKEW * dy) * U_SCALE.
     """
 
     gaussians: NDArray[np.int32]
@@ -129,7 +114,7 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
     """
     shapes, eps2d = shapes or Shapes.of(scene), scene.rendering.eps2d
     count = len(scene)
-    values, depths = np.empty((count, len(Column))), np.empty(count)
+    values, depths = np.empty((count, 8)), np.empty(count)
     gaussians = np.empty(count, dtype=np.int32)
     intrinsics = np.array(
         [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, *camera.slope_limits],

@@ -45,7 +45,7 @@ class DeviceIntersections:
 
     Attributes:
         gaussians: [V] int64, indices into the scene, front to back.
-        values: [V, 8] float64, see `cpu.Column`.
+        values: [V, 8] float64, see `cpu.Projection`.
         starts: [tiles + 1] int64, first entry of each tile.
         ranks: [E] int32, rank (index into `gaussians`) of each entry, front to back within a tile.
         slots: [E] int32, slot of each entry; the slots of one Gaussian are contiguous.
@@ -422,14 +422,12 @@ class CachedRasterizer(Rasterizer):
         """Rasterizer that computes blend weights in every call."""
         return self._uncached
 
-    def cache_weights(self, camera: Camera) -> bool:
-        """Cache a view's weights if they fit, and return whether the view has cached weights.
+    def cache_weights(self, camera: Camera) -> None:
+        """Cache a view's weights if they fit.
 
         The first call for a view decides whether its weights fit; later calls do not reconsider this.
         """
-        key = camera_key(camera)
-        self._cached.add(key, lambda: self._counted(camera))
-        return key in self._cached
+        self._cached.add(camera_key(camera), lambda: self._counted(camera))
 
     @property
     def caches(self) -> dict[str, Cache[CameraKey, Any]]:

@@ -105,7 +105,7 @@ def project(
     Args:
         camera: [23] float64: the upper three rows of world_to_camera, fx, fy, cx, cy, width, height, near, and
             `Camera.slope_limits`.
-        values: Output [N, 8] float64, see `cpu.Column`; rows of invisible Gaussians are not written.
+        values: Output [N, 8] float64, see `cpu.Projection`; rows of invisible Gaussians are not written.
         depths: Output [N] float64, infinite for invisible Gaussians.
         counts: Output [N] int32, 0 for invisible Gaussians.
     """

@@ -214,5 +214,4 @@ def _to_bytes(image: Tensor) -> VideoFrame:
         alpha = image[:, :, 3:]
         straight = torch.where(alpha > _INVISIBLE, image[:, :, :3] / alpha.clamp_min(_INVISIBLE), 0.0)
         image = torch.cat([straight.clamp_max(1), alpha], dim=2)
-    frame: VideoFrame = (image * 255).round().to(torch.uint8).numpy().astype(np.uint8, copy=False)
-    return frame
+    return (image * 255).round().to(torch.uint8).numpy().astype(np.uint8, copy=False)

@@ -417,15 +417,6 @@ def scale_name(scale: int) -> str:
     return f"scale {scale} (1/{1 << scale})" if scale else "scale 0 (full size)"
 
 
-def draw_points(axes: Axes, x: Floats, values: Floats, **options: Any) -> None:
-    """Draw points [n] that may lie on the border of the axes; do nothing if `x` is empty.
-
-    matplotlib's layout would extend an empty, unclipped line to the corner of the figure.
-    """
-    if len(x):
-        axes.plot(x, values, clip_on=False, **options)
-
-
 def set_log_x(axes: Axes, values: Floats, label: str) -> None:
     """Make the x axis logarithmic, with limits that include the values [n]."""
     limits = log_limits(values, X_MARGIN)

@@ -612,13 +612,11 @@ def _changes(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 
 
 def _centers(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    centers: NDArray[np.float64] = np.stack([camera.center.double().numpy() for camera in cameras])
-    return centers
+    return np.stack([camera.center.double().numpy() for camera in cameras])
 
 
 def _rotations(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    rotations: NDArray[np.float64] = np.stack([camera.world_to_camera[:3, :3].double().numpy() for camera in cameras])
-    return rotations
+    return np.stack([camera.world_to_camera[:3, :3].double().numpy() for camera in cameras])
 
 
 def _relative_intrinsics(camera: Camera) -> NDArray[np.float64]:

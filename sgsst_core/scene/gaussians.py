@@ -193,10 +193,7 @@ def rotations(quats: Tensor) -> Tensor:
     """Return the rotation matrices [P, 3, 3] of wxyz quaternions [P, 4]; the identity for a zero quaternion."""
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     nonzero = torch.where((quats != 0).any(1, keepdim=True), quats, identity)
-    matrices: Tensor = torch.from_numpy(
-        scipy.spatial.transform.Rotation.from_quat(nonzero.roll(-1, 1).numpy()).as_matrix()
-    )
-    return matrices
+    return torch.from_numpy(scipy.spatial.transform.Rotation.from_quat(nonzero.roll(-1, 1).numpy()).as_matrix())
 
 
 def unit_rotations(quats: Tensor) -> Tensor:

@@ -602,7 +602,7 @@ class Rates:
 
     def remember(self, pixels: float, rate: float) -> None:
         """Remember the rate of a job's steps; one that cannot be written is forgotten."""
-        rates, size = _read(self._path), _size(pixels)
+        rates, size = _read(self._path), str(round(math.log2(max(pixels, 1.0))))
         own = rates.setdefault(self._key, {})
         own[size] = math.exp((1 - _LATEST) * math.log(own.get(size, rate)) + _LATEST * math.log(rate))
         with suppress(OSError, OutputError):
@@ -622,10 +622,6 @@ class Rates:
             wait_for(self._network.device)
             seconds = time.perf_counter() - started
         return side * side / seconds
-
-
-def _size(pixels: float) -> str:
-    return str(round(math.log2(max(pixels, 1.0))))
 
 
 def _read(path: Path) -> dict[str, dict[str, float]]:

@@ -114,7 +114,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
         if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
             _timed(stylizer, "preview", callbacks.preview)
             last_preview = time.perf_counter()
-        pace.add_beside(time.perf_counter() - now)
+        pace.beside += time.perf_counter() - now
     pace.remember()
     choice = stylizer.job.plan.time_choice
     return "within" if choice and stylizer.job.settings.steps_sos < choice.all_steps else "finished"
@@ -124,17 +124,17 @@ class _Pace:
     """Pace of a job's steps: seconds per pixel that this rank passes through the network.
 
     Before the first ten steps, it is that of the estimate. The very first one does not count: it prepares the style.
+
+    Attributes:
+        beside: Seconds between the steps so far, for reports, checkpoints and previews.
     """
 
     def __init__(self, stylizer: Stylizer) -> None:
         self._stylizer, self._estimate, self._first = stylizer, estimate(stylizer.job), len(stylizer.history)
-        self._earlier, self._beside = stylizer.seconds, 0.0
+        self._earlier, self.beside = stylizer.seconds, 0.0
         self._started = time.perf_counter(), time.process_time()
-        stylizer.job.team.expect(self._estimate.seconds)
-
-    def add_beside(self, seconds: float) -> None:
-        """Record time that is not a step: a checkpoint or a preview."""
-        self._beside += seconds
+        for ranks in (stylizer.job.team.everybody, stylizer.job.team.group):
+            ranks.set_timeout_for(self._estimate.seconds)
 
     def step_seconds(self, *, coarse: bool = False, least: int = _KNOWN) -> float:
         """Return the seconds of a mean step of a phase, with what happens between steps.
@@ -148,7 +148,7 @@ class _Pace:
         if len(history) - start < least or not pixels:
             return expected.seconds_coarse if coarse else expected.seconds
         seconds = history[-1].seconds - history[start - 1].seconds
-        beside = self._beside / (history[-1].seconds - self._earlier)
+        beside = self.beside / (history[-1].seconds - self._earlier)
         return (work.coarse if coarse else work.sos) * seconds / pixels * (1 + beside)
 
     def ending_seconds(self) -> float:

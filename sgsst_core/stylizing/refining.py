@@ -166,11 +166,7 @@ class _Refining:
 
     def _survey(self) -> list[int]:
         """Survey every view, and return those that see anything."""
-        collectives, context = self._collectives, self._planning_context
-
-        def visit(camera: Camera, weights: Tensor) -> None:
-            self._footprints.add(camera, weights.cpu())
-
+        collectives, context, visit = self._collectives, self._planning_context, self._footprints.add
         survey = survey_views(self._scene, context.cameras, self._rasterizer, collectives, self._show, visit)
         self._footprints.sums = self._sum(self._footprints.sums)
         self._footprints.reach = torch.stack(collectives.all_gather(self._footprints.reach)).amax(dim=0)

@@ -38,7 +38,6 @@ from sgsst_core.regions import ContentMaps, RegionMaps, Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import (
     ColorSubspace,
-    color_subspace_of,
     luminance,
     on_screen,
     on_screen_by_luminance,
@@ -312,10 +311,6 @@ class JobStyles:
     def content_weight(self) -> float | None:
         """Largest content weight of a Gaussian; None for that of the settings."""
         return None if self.content_weights is None else float(self.content_weights.max())
-
-    def color_subspace(self, settings: Settings) -> ColorSubspace | None:
-        """Return the color subspace of the job; None if colors are free."""
-        return color_subspace_of(self.all, settings)
 
     @property
     def all(self) -> list[Style]:

@@ -34,7 +34,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions import Regions
 from sgsst_core.scales import EVEN, ScaleWeights, ratio, smoothed
 from sgsst_core.scene.camera import Camera, checked_cameras
-from sgsst_core.scene.colors import ColorSubspace
+from sgsst_core.scene.colors import ColorSubspace, color_subspace_of
 from sgsst_core.scene.gaussians import Scene, checked_scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
@@ -198,7 +198,7 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     Returns:
         [N, 3] float32 on the CPU.
     """
-    colors, subspace = job.scene.sh_dc.clone(), job.styles.color_subspace(job.settings)
+    colors, subspace = job.scene.sh_dc.clone(), color_subspace_of(job.styles.all, job.settings)
     colors[job.plan.seen] = optimized
     if transfer:
         transferred = transferred_colors(job, optimized)
@@ -502,7 +502,7 @@ class Stylizer:
         frozen = job.styles.regions.frozen[seen] if job.styles.regions else torch.zeros(0, dtype=torch.bool)
         #: Mask [n, 1] of frozen Gaussians; None if there are none.
         self._frozen = frozen.to(device)[:, None] if frozen.any() else None
-        subspace = job.collectives.broadcast(lambda: job.styles.color_subspace(settings))
+        subspace = job.collectives.broadcast(lambda: color_subspace_of(job.styles.all, settings))
         self._optimizer = ColorOptimizer(
             self.sh_dc,
             job.network.unit,

@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import Cache, content_fraction
+from sgsst_core.budget import Cache
 from sgsst_core.devices import Timer
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import Color
@@ -295,13 +295,17 @@ class ViewTargets:
         self._maps = maps
         self._content_maps = content_maps
         has_maps = maps is not None or content_maps is not None
-        cached = int(memory * content_fraction(loss.network.device.type, weighted=weighted, has_maps=has_maps))
+        spares_coverage = loss.network.device.type != "cpu" and not weighted
+        cached = int(memory * (0.5 - 0.25 * has_maps + 0.25 * spares_coverage))
         images = cached // 2 if drawn else 0
         self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
         self._region_weights: Cache[tuple[int, bool], list[list[Tensor]]] = Cache(
             memory // 4 if has_maps else 0, lambda every: sum(map(_pyramid_bytes, every))
         )
-        self._images: Cache[_ContentKey, ScaledView] = Cache(images, _image_bytes)
+        # Whole scaled views count, so that all ranks agree on what fits.
+        self._images: Cache[_ContentKey, ScaledView] = Cache(
+            images, lambda view: view.size[0] * view.size[1] * 3 * view.image.itemsize
+        )
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
         self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
 
@@ -426,11 +430,6 @@ class ViewTargets:
 
 #: Index of the view, scale, and every rank's pieces of it.
 _ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
-
-
-def _image_bytes(view: ScaledView) -> int:
-    """Return the size in bytes of a whole scaled view, which all ranks agree on."""
-    return view.size[0] * view.size[1] * 3 * view.image.itemsize
 
 
 def _pyramid_bytes(pyramid: list[Tensor]) -> int:

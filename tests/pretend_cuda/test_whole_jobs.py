@@ -17,6 +17,7 @@ from sgsst_core.errors import DeviceMemoryError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.files.scene_file import read_scene
+from sgsst_core.scene.colors import color_subspace_of
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -91,7 +92,8 @@ def test_job_runs_resumes_and_reports(
     assert (plan.device, plan.uncached, plan.weighted) == ("cuda", "triton", scan)
     used, spare = first.stylizer.job.views.rasterizer.caches["intersections"].capacity, plan.spare // 2
     assert plan.cached_weights != "none" or used == memory_for("rasterizer", plan.memory_limit) + spare > spare > 0
-    assert (first.stylizer.job.styles.color_subspace(first.stylizer.job.settings) is not None) == gray
+    job = first.stylizer.job
+    assert (color_subspace_of(job.styles.all, job.settings) is not None) == gray
     assert run_job(first, steps=1).stopped == "interrupted"
     second = prepare(asked, resume=Resume(True))
     assert second.stylizer.job.plan.rasterizer == plan.rasterizer

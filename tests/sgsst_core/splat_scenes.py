@@ -101,4 +101,4 @@ def pixels_like(view: Camera, seed: int = 6) -> Tensor:
 
 def is_cached(rasterizer: Rasterizer, view: Camera) -> bool:
     """Return whether a view has cached blend weights."""
-    return camera_key(view) in rasterizer.caches["weights"]
+    return camera_key(view) in rasterizer.caches["weights"].values

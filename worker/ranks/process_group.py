@@ -136,6 +136,21 @@ def _stacked(parts: Sequence[LayerStatistics]) -> LayerStatistics:
     return LayerStatistics(torch.stack(counts), torch.stack(means), torch.stack(moments))
 
 
+def _half(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the row indices [n] and column indices [n] of a matrix's upper triangle with diagonal."""
+    rows, columns = torch.triu_indices(len(matrix), len(matrix), device=matrix.device).unbind()
+    return rows, columns
+
+
+def _symmetric(halves: Tensor, channels: int) -> Tensor:
+    """Return the symmetric matrices [k, channels, channels] that have these upper triangles [k, n]."""
+    matrices = halves.new_empty((len(halves), channels, channels))
+    rows, columns = _half(matrices[0])
+    matrices[:, rows, columns] = halves
+    matrices[:, columns, rows] = halves
+    return matrices
+
+
 class ProcessGroupCollectives(Collectives):
     """`Collectives` of a torch.distributed group.
 
@@ -150,7 +165,6 @@ class ProcessGroupCollectives(Collectives):
         self._group = group
         self.gpu_sharing = gpu_sharing
         self._timeout = timeout
-        self._halves: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
         self.local_size = self.all_gather(_machine()).count(_machine())
 
     def gather_parts(
@@ -234,7 +248,7 @@ class ProcessGroupCollectives(Collectives):
             mean = weighted / count.clamp_min(torch.finfo(total.dtype).tiny)
             away = stack.mean - mean
             moment = stack.centered + away[:, :, None] * away[:, None, :] * stack.count[..., None]
-            rows, columns = self._half(moment[0])
+            rows, columns = _half(moment[0])
             moments.append(moment[:, rows, columns])  # symmetric: one triangle is enough
             counts.append(count)
             means.append(mean)
@@ -242,25 +256,9 @@ class ProcessGroupCollectives(Collectives):
         merged: dict[int, LayerStatistics] = {}
         values = halves.split([each.numel() for each in moments])
         for some, count, mean, half in zip(indices.values(), counts, means, values, strict=True):
-            centered = self._symmetric(half.view(len(some), -1), mean.shape[1])
+            centered = _symmetric(half.view(len(some), -1), mean.shape[1])
             merged |= zip(some, map(LayerStatistics, count[:, 0], mean, centered), strict=True)
         return [merged[index] for index in range(len(parts))], added
-
-    def _half(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the row indices [n] and column indices [n] of a matrix's upper triangle with diagonal, cached."""
-        key = len(matrix), matrix.device
-        if key not in self._halves:
-            rows, columns = torch.triu_indices(len(matrix), len(matrix), device=matrix.device).unbind()
-            self._halves[key] = rows, columns
-        return self._halves[key]
-
-    def _symmetric(self, halves: Tensor, channels: int) -> Tensor:
-        """Return the symmetric matrices [k, channels, channels] that have these upper triangles [k, n]."""
-        matrices = halves.new_empty((len(halves), channels, channels))
-        rows, columns = self._half(matrices[0])
-        matrices[:, rows, columns] = halves
-        matrices[:, columns, rows] = halves
-        return matrices
 
     def all_gather(self, value: T) -> list[T]:
         """See `Collectives`."""

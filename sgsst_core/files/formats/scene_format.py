@@ -293,8 +293,7 @@ def logarithms(path: Path, deviations: NDArray[np.float64]) -> NDArray[np.float6
             f"{path}: its scales are negative, so they are logarithms, but the format stores standard deviations. "
             "Export the scene again."
         )
-    result: NDArray[np.float64] = np.log(deviations)
-    return result
+    return np.log(deviations)
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -309,8 +308,7 @@ def logits(path: Path, opacities: NDArray[np.float64]) -> NDArray[np.float64]:
             f"{path}: its opacities are not in 0..1, so they are logits, but the format stores opacities. "
             "Export the scene again."
         )
-    result: NDArray[np.float64] = np.log(opacities) - np.log1p(-opacities)
-    return result
+    return np.log(opacities) - np.log1p(-opacities)
 
 
 @np.errstate(invalid="ignore")
@@ -488,5 +486,4 @@ def harmonics_matrix(rotation: NDArray[np.float64], coefficients: int) -> NDArra
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     values = (spherical_harmonics(*each.T)[:coefficients] for each in (directions, directions @ rotation))
     new, old = (np.reshape(each, (coefficients, _DIRECTIONS)).T for each in values)
-    matrix: NDArray[np.float64] = np.round(np.linalg.lstsq(new, old, rcond=None)[0], _DECIMALS)
-    return matrix
+    return np.round(np.linalg.lstsq(new, old, rcond=None)[0], _DECIMALS)

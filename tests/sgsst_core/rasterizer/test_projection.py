@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from enum import IntEnum
 from fractions import Fraction
 
 import numpy as np
@@ -10,7 +11,6 @@ import torch
 
 from sgsst_core.constants import EPS2D
 from sgsst_core.rasterizer.cpu import (
-    Column,
     CpuRasterizer,
     project,
 )
@@ -21,6 +21,19 @@ from tests.sgsst_core.rasterizer.splat_reference import splat
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose, single, together
 
 _HALF_LOG2_E = 0.5 * math.log2(math.e)
+
+
+class Column(IntEnum):
+    """Columns of `Projection.values`."""
+
+    X = 0
+    Y = 1
+    SKEW = 2
+    U_SCALE = 3
+    W_SCALE = 4
+    LOG2_OPACITY = 5
+    EXTENT_X = 6
+    EXTENT_Y = 7
 
 
 def test_projection_agrees_with_plain_pytorch() -> None:

@@ -259,7 +259,7 @@ VALUES = [
         (Decision("axes", "rub", "seen"),),
     ),
     Lens.of("OPENCV", (0.1, -0.02), (640, 480), (500.0, 500.0, 320.0, 240.0)),
-    Machine("cpu", 3, problems={"triton": "no GPU"}),
+    Machine("cpu", 3, problem="no GPU"),
 ]
 
 
