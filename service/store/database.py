@@ -302,12 +302,10 @@ class Database:
 
     @contextmanager
     def _upgrading(self, engine: Engine) -> Iterator[None]:
-        if self.sqlite and self.url.database:
-            with Path(self.url.database).with_suffix(".lock").open("w") as file:
+        if self.sqlite:
+            with Path(str(self.url.database)).with_suffix(".lock").open("w") as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
                 yield
-        elif self.sqlite:
-            yield
         else:
             with engine.begin() as connection:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
