@@ -115,8 +115,8 @@ def _refusal(error: Exception) -> ServiceError | None:
     return problems.DATABASE_UNAVAILABLE() if away or getattr(error, "connection_invalidated", False) else None
 
 
-def _impatient_connection(seconds: float) -> Any:
-    """Return a subclass of psycopg's connection that bounds each wait for the server.
+def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, seconds: float) -> Any:
+    """Connect to PostgreSQL with bounded waits.
 
     A stopped server or a frozen machine still acknowledges packets, so no TCP timeout detects it.
     """
@@ -134,7 +134,7 @@ def _impatient_connection(seconds: float) -> Any:
                     self.pgconn.finish()  # a late response would be taken for that of another query
                 raise
 
-    return ImpatientConnection
+    return ImpatientConnection.connect(*arguments, **options)
 
 
 Clock = Callable[[], float]
@@ -310,11 +310,6 @@ class Database:
             with engine.begin() as connection:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
                 yield
-
-
-def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, seconds: float) -> Any:
-    """Connect to PostgreSQL with bounded waits."""
-    return _impatient_connection(seconds).connect(*arguments, **options)
 
 
 def _set_pragmas(connection: Any, _record: Any, *, busy_seconds: float) -> None:
