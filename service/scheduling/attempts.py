@@ -289,10 +289,6 @@ class RunningAttempt:
             future.cancel()
             raise problems.STORE_UNAVAILABLE() from error
 
-    def _publish_later(self, publish: Callable[[], None]) -> None:
-        """Publish files without waiting for the file store."""
-        self._pending.append(self._files.submit(publish))
-
     def _check_published(self) -> None:
         """Raise the error of publishing that has failed."""
         while self._pending and self._pending[0].done():
@@ -358,7 +354,7 @@ class RunningAttempt:
             self._progress.write()
             self._check_published()
             if not self._pending:
-                self._publish_later(self._publisher.publish_unfinished)
+                self._pending.append(self._files.submit(self._publisher.publish_unfinished))
             if self._finish_requested:
                 process.finish()
             if self._stop_request is not None:
@@ -370,7 +366,7 @@ class RunningAttempt:
     def _handle(self, report: Report) -> None:
         """Handle a report, except for its ending."""
         if report.stored is not None:
-            self._publish_later(partial(self._publisher.publish, [report.stored]))
+            self._pending.append(self._files.submit(self._publisher.publish, [report.stored]))
         if report.prepared:
             self._store.leases.start(self.lease)
         if report.progress is not None:
