@@ -22,7 +22,7 @@ from service.files.objects import Artifacts
 from service.problems import DamagedWeightsError, DatabaseUnavailableError
 from service.scheduling.attempts import RunningAttempt, prepare
 from service.scheduling.capacity import Capacity, Grant, Machine, is_dead, own_name
-from service.scheduling.housekeeping import Housekeeper
+from service.scheduling.housekeeping import clean_up, remove_orphans
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings, check_weights, start
 from service.store import Store, open_store
@@ -56,8 +56,8 @@ def lease_next_job(
     return (lease, granted) if lease is not None and granted is not None else None
 
 
-#: Intervals between rounds of housekeeping, and of sending webhooks, in seconds.
-_HOUSEKEEPING_SECONDS, _WEBHOOK_SECONDS = 60.0, 2.0
+#: Intervals between rounds of housekeeping, of searching for orphaned files, and of sending webhooks, in seconds.
+_HOUSEKEEPING_SECONDS, _SEARCH_SECONDS, _WEBHOOK_SECONDS = 60.0, 3600.0, 2.0
 #: Delay before the next pass after one has failed, in seconds.
 _OUTAGE_SECONDS = 2.0
 #: Interval between checks of ending attempts during the shutdown, in seconds.
@@ -88,7 +88,8 @@ class Dispatcher:
         #: interval in seconds, and function.
         self._helpers = [
             ("lease-keeper", _CHECK_FRACTION * settings.lease_seconds, self._abandon_late),
-            ("housekeeper", _HOUSEKEEPING_SECONDS, Housekeeper(store, self._artifacts, blobs).clean_up),
+            ("housekeeper", _HOUSEKEEPING_SECONDS, partial(clean_up, store, self._artifacts, blobs)),
+            ("orphan-search", _SEARCH_SECONDS, partial(remove_orphans, store, self._artifacts, blobs)),
         ]
         if settings.webhooks:
             self._helpers.append(("webhooks", _WEBHOOK_SECONDS, Deliverer(settings, store).deliver_due))
