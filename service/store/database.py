@@ -31,8 +31,10 @@ _PROBE_SECONDS = 0.2
 _BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "40", "55")
 #: The same for errors that concern a statement or its values, so they are bugs of the service. All others are outages,
 #: in whatever words: a server that is a standby, shuts down, or has no memory or connections left.
-_BUGS = (*(f"SQLITE_{each}" for each in ("CONSTRAINT", "ERROR", "MISMATCH", "MISUSE", "RANGE", "TOOBIG")),)
-_BUGS += ("21", "22", "23", "42", "44", "54")
+_BUGS = (
+    *(f"SQLITE_{each}" for each in ("CONSTRAINT", "ERROR", "MISMATCH", "MISUSE", "RANGE", "TOOBIG")),
+    *("21", "22", "23", "42", "44", "54"),
+)
 #: Names of SQLite's and codes of PostgreSQL's errors for rows that refer to a missing one or exist already.
 _CHANGED = (*(f"SQLITE_CONSTRAINT_{each}" for each in ("FOREIGNKEY", "PRIMARYKEY", "UNIQUE")), "23503", "23505")
 

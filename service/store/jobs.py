@@ -258,10 +258,9 @@ def _queries(dialect: str) -> dict[str, TextClause]:
         "page": f"SELECT number, value FROM (SELECT {position} AS position, {value} AS value, {index} AS number "
         f"{of_jobs}) AS entries WHERE position >= :start ORDER BY position LIMIT :most",
     }
-    lists = {name: [each for each in ("ids", "roles") if f":{each}" in text_] for name, text_ in texts.items()}
     return {
-        name: text(text_).bindparams(*(bindparam(each, expanding=True) for each in lists[name]))
-        for name, text_ in texts.items()
+        name: text(sql).bindparams(*(bindparam(each, expanding=True) for each in ("ids", "roles") if f":{each}" in sql))
+        for name, sql in texts.items()
     }
 
 
