@@ -261,11 +261,12 @@ def check_roles(
         )
     unfit = partial(problems.INVALID_INPUT, code="invalid-cameras")
     if by_role["cameras"] and orbit:
-        message = "Both 'cameras' and the parameter 'orbit' were sent. Send only one of them."
-        raise unfit(message, input="cameras")
+        raise unfit("Both 'cameras' and the parameter 'orbit' were sent. Send only one of them.", input="cameras")
     if by_role["photos"] and not by_role["cameras"]:
-        message = "'photos' requires 'cameras', and cannot be combined with an orbit. Send the cameras of the photos."
-        raise unfit(message, input="photos")
+        raise unfit(
+            "'photos' requires 'cameras', and cannot be combined with an orbit. Send the cameras of the photos.",
+            input="photos",
+        )
     _check_camera_files([entry["name"] for entry in by_role["cameras"]])
     _check_names(inputs)
 
@@ -378,15 +379,14 @@ def _camera_path(files: Sequence[Path]) -> Path | None:
 def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, ...]:
     """Return the regions with the paths of their staged styles and masks."""
     paths = {path.name: path for path in staged.styles}
-
-    def staged_file(file: StyleFile) -> StyleFile:
-        return replace(file, path=paths[staged_name("style", str(file.path))])
-
-    def staged_region(region: RegionRequest) -> RegionRequest:
-        selection = region.selection and replace(region.selection, path=region_mask(region))
-        return replace(region, selection=selection, styles=tuple(map(staged_file, region.styles)))
-
-    return tuple(map(staged_region, parameters.region_requests))
+    return tuple(
+        replace(
+            region,
+            selection=region.selection and replace(region.selection, path=region_mask(region)),
+            styles=tuple(replace(file, path=paths[staged_name("style", str(file.path))]) for file in region.styles),
+        )
+        for region in parameters.region_requests
+    )
 
 
 def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:

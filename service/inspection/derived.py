@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -57,8 +56,6 @@ _VIDEO_SECONDS_PER_BYTE, _VIDEO_SECONDS_PER_PIXEL, _VIDEO_BYTES_PER_PIXEL = 4e-8
 #: Memory of the encoder, which looks some frames ahead.
 _ENCODER_BYTES = 1 << 30
 _BLENDS = "blends/"
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -239,7 +236,7 @@ class DerivedFiles:
         if making is None:
             making = self._making[key] = _Making(work)
             making.task = asyncio.create_task(self._make(job, work, quotas, making.show))
-            making.task.add_done_callback(lambda task: self._end(key, task))
+            making.task.add_done_callback(lambda _: self._making.pop(key))
         elif making.work != work:
             raise problems.BUSY(f"Another {work.name} of this job is being rendered. Try again when it is done.")
         assert making.task is not None
@@ -256,11 +253,6 @@ class DerivedFiles:
         if row is None:
             raise problems.NOT_FOUND(f"The results of job {job.id} are gone.")
         return row
-
-    def _end(self, key: tuple[str, str], task: asyncio.Task[None]) -> None:
-        del self._making[key]
-        if not task.cancelled() and (error := task.exception()) is not None:  # perhaps nobody waits any longer
-            _log.info("%s not made: %s", key[1], error, extra={"job": key[0]})
 
     def _result(self, job_id: str) -> ArtifactRow:
         row = self._store.jobs.artifact(job_id, RESULT)

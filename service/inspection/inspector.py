@@ -282,44 +282,32 @@ class Inspector:
             seconds += _planning_seconds(valid, _limits(self._settings))
         kind: Kind = "plan" if work == "plan" else "large" if _size(inputs) > _LARGE_BYTES else "validate"
         with suspended():  # the process has its own limits
-            async with self.processes.turn(owner, kind) as process:
-                answer = await self._ask_process(process, work, owner, inputs, rows, parameters, seconds, show)
+            async with (
+                self.processes.turn(owner, kind) as process,
+                self._threads.folder(owner, self._folder) as folder,
+            ):
+                paths = await self._threads.run(owner, self._blobs.fetch, rows, folder, size=_size(inputs))
+                staged = await self._threads.run(owner, stage, folder, inputs, paths)
+                most = _PLAN_BYTES_PER_GAUSSIAN * self._settings.max_gaussians + _PLAN_BYTES
+                request = WorkRequest(
+                    work=work,
+                    folder=folder,
+                    staged=staged,
+                    parameters=parameters,
+                    seconds=seconds,
+                    memory=self._memory(inputs),
+                    limits=_limits(self._settings),
+                    output=(PLAN, most) if work == "plan" else None,
+                )
+                answer = await process.ask(request, show)
+                if request.output and "findings" in answer:
+                    target = stored_plan(self._settings, owner, inputs, parameters)
+                    await self._threads.run(owner, _store_plan, folder / PLAN, target)
         transient = answer.get("error", {}).get("code") in (problems.INSPECTION_LIMIT.code, WeightsError.code)
         if not transient:  # a later check may succeed
             key = _key(self._settings, work, owner, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
         return findings_of(answer)
-
-    async def _ask_process(
-        self,
-        process: InspectionProcess,
-        work: Work,
-        owner: str,
-        inputs: Sequence[Mapping[str, Any]],
-        rows: Mapping[str, BlobRow],
-        parameters: JobParameters,
-        seconds: float,
-        show: Show,
-    ) -> dict[str, Any]:
-        async with self._threads.folder(owner, self._folder) as folder:
-            paths = await self._threads.run(owner, self._blobs.fetch, rows, folder, size=_size(inputs))
-            staged = await self._threads.run(owner, stage, folder, inputs, paths)
-            most = _PLAN_BYTES_PER_GAUSSIAN * self._settings.max_gaussians + _PLAN_BYTES
-            request = WorkRequest(
-                work=work,
-                folder=folder,
-                staged=staged,
-                parameters=parameters,
-                seconds=seconds,
-                memory=self._memory(inputs),
-                limits=_limits(self._settings),
-                output=(PLAN, most) if work == "plan" else None,
-            )
-            answer = await process.ask(request, show)
-            if request.output and "findings" in answer:
-                target = stored_plan(self._settings, owner, inputs, parameters)
-                await self._threads.run(owner, _store_plan, folder / PLAN, target)
-            return answer
 
     def _memory(self, inputs: Sequence[Mapping[str, Any]]) -> int:
         """Return the memory limit of reading in bytes; photos do not add to it, because they are read one at a time."""

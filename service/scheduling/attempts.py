@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 from service import problems
 from service.deadlines import LEAST_RATE
 from service.files.blobs import Blobs
-from service.files.objects import Artifacts
+from service.files.objects import Artifacts, ObjectStore
 from service.inputs import CHECKPOINT, PLAN, job_spec, layout, stage, stored_parameters
 from service.inspection.inspector import stored_plan
 from service.problems import LeaseLostError
@@ -125,72 +125,63 @@ class ChildProcess:
         return self._process.wait()
 
 
-class Stager:
-    """Preparer of the folders of a dispatcher's attempts.
+def prepare(
+    settings: ServiceSettings,
+    store: Store,
+    blobs: Blobs,
+    artifacts: Artifacts,
+    cluster: bool,
+    folder: Path,
+    lease: Lease,
+    grant: Grant,
+    spec: JobSpec,
+) -> None:
+    """Create the folder of an attempt at a job.
 
     Args:
         cluster: Whether attempts run on a Ray cluster. If the file store is remote, ranks stage the files themselves.
+
+    Raises:
+        LostFileError, DamagedFileError: If an input cannot be used.
+        StoreError: If the file store does not respond.
     """
-
-    def __init__(
-        self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts, *, cluster: bool
-    ) -> None:
-        self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
-        self.cluster = cluster
-
-    def prepare(self, folder: Path, lease: Lease, grant: Grant, spec: JobSpec) -> None:
-        """Create the folder of an attempt at a job.
-
-        Raises:
-            LostFileError, DamagedFileError: If an input cannot be used.
-            StoreError: If the file store does not respond.
-        """
-        (folder / "out").mkdir(parents=True)
-        job = lease.job
-        checkpoint = self._store.jobs.artifact(job.id, CHECKPOINT)
-        on_ranks = self.cluster and not self._artifacts.local and not spec.paintings
-        workplace = self._workplace(lease, checkpoint) if on_ranks else None
-        if workplace is None:
-            self._stage(folder, lease, checkpoint)
-        settings = spec.settings
-        if grant.memory is not None:
-            settings = settings.model_copy(update={"memory_limit": grant.memory})
-        task = Task(
-            spec=spec.model_copy(update={"settings": settings, "resume": checkpoint is not None}),
-            workers=grant.ranks,
-            cluster=self.cluster,
-            checkpoint_seconds=self._settings.checkpoint_seconds,
-            preview_seconds=self._settings.preview_seconds,
-            workplace=workplace,
-        )
-        (folder / "task.json").write_text(task.model_dump_json())
-
-    def _stage(self, folder: Path, lease: Lease, checkpoint: ArtifactRow | None) -> None:
-        """Stage the job's files in the attempt's folder."""
+    out, job, workplace = folder / "out", lease.job, None
+    out.mkdir(parents=True)
+    checkpoint = store.jobs.artifact(job.id, CHECKPOINT)
+    rows = store.inputs.blobs(sorted({entry["sha256"] for entry in job.inputs}))
+    if cluster and not artifacts.local and not spec.paintings:
+        workplace = _workplace(artifacts.objects, lease, rows, checkpoint)
+    else:
         if checkpoint is not None:
-            fetch_checkpoint(self._artifacts, checkpoint, folder / "out")
-        job = lease.job
-        stage(folder, job.inputs, self._blobs.fetch(self._input_rows(lease), folder))
+            fetch_checkpoint(artifacts, checkpoint, out)
+        stage(folder, job.inputs, blobs.fetch(rows, folder))
         (folder / PLAN).symlink_to(
-            stored_plan(self._settings, job.owner, job.inputs, stored_parameters(job.parameters)).absolute()
+            stored_plan(settings, job.owner, job.inputs, stored_parameters(job.parameters)).absolute()
         )
+    of_job = spec.settings
+    if grant.memory is not None:
+        of_job = of_job.model_copy(update={"memory_limit": grant.memory})
+    task = Task(
+        spec=spec.model_copy(update={"settings": of_job, "resume": checkpoint is not None}),
+        workers=grant.ranks,
+        cluster=cluster,
+        checkpoint_seconds=settings.checkpoint_seconds,
+        preview_seconds=settings.preview_seconds,
+        workplace=workplace,
+    )
+    (folder / "task.json").write_text(task.model_dump_json())
 
-    def _input_rows(self, lease: Lease) -> dict[str, BlobRow]:
-        return self._store.inputs.blobs(sorted({entry["sha256"] for entry in lease.job.inputs}))
 
-    def _workplace(self, lease: Lease, checkpoint: ArtifactRow | None) -> StoreWorkplace:
-        """Return the description that ranks on other machines need to stage the job's files."""
-        files = [
-            Published(sha256, f"{BLOBS}/{row.location}", row.size, sha256)
-            for sha256, row in self._input_rows(lease).items()
-        ]
-        saved = None
-        if checkpoint is not None:
-            saved = Published(CHECKPOINT, checkpoint.location, checkpoint.size, checkpoint.sha256)
-        objects, weights = self._artifacts.objects, store_weights(self._artifacts.objects)
-        return StoreWorkplace(
-            objects.url, lease.job_id, lease.epoch, tuple(lease.job.inputs), tuple(files), saved, weights
-        )
+def _workplace(
+    objects: ObjectStore, lease: Lease, rows: Mapping[str, BlobRow], checkpoint: ArtifactRow | None
+) -> StoreWorkplace:
+    """Return the description that ranks on other machines need to stage the job's files."""
+    files = [Published(sha256, f"{BLOBS}/{row.location}", row.size, sha256) for sha256, row in rows.items()]
+    saved = None
+    if checkpoint is not None:
+        saved = Published(CHECKPOINT, checkpoint.location, checkpoint.size, checkpoint.sha256)
+    weights = store_weights(objects)
+    return StoreWorkplace(objects.url, lease.job_id, lease.epoch, tuple(lease.job.inputs), tuple(files), saved, weights)
 
 
 #: Time that a canceled job has to finish its step, in seconds.
@@ -211,7 +202,7 @@ T = TypeVar("T")
 
 
 class RunningAttempt:
-    """Attempt that runs in its own thread; the dispatcher's loop queries and controls it."""
+    """Attempt that runs in its own thread, started by the constructor; the dispatcher queries and controls it."""
 
     def __init__(
         self,
@@ -221,11 +212,13 @@ class RunningAttempt:
         settings: ServiceSettings,
         store: Store,
         artifacts: Artifacts,
-        stager: Stager,
+        prepare: Callable[[Path, Lease, Grant, JobSpec], None],
+        cluster: bool,
     ) -> None:
         self.lease = lease
         self.grant = grant
-        self._folder, self._settings, self._store, self._stager = folder, settings, store, stager
+        self._folder, self._settings, self._store = folder, settings, store
+        self._prepare, self._cluster = prepare, cluster
         self._process: ChildProcess | None = None
         self._stop_request: StopRequest | None = None
         self._finish_requested = False
@@ -235,6 +228,7 @@ class RunningAttempt:
         self._files = ThreadPoolExecutor(1, f"{lease.job_id}-files")
         self._pending: deque[Future[None]] = deque()
         self._thread = threading.Thread(target=self._run, name=lease.job_id, daemon=True)
+        self._thread.start()
 
     @property
     def alive(self) -> bool:
@@ -245,10 +239,6 @@ class RunningAttempt:
     def abandoned(self) -> bool:
         """Whether the attempt was abandoned or has ended."""
         return self._stop_request == StopRequest.ABANDON or not self.alive
-
-    def start(self) -> None:
-        """Start the attempt."""
-        self._thread.start()
 
     def obey(self, status: JobStatus) -> None:
         """Do what the job's status asks for on behalf of its user: stop, or end with the present colors as result."""
@@ -299,10 +289,6 @@ class RunningAttempt:
             future.cancel()
             raise problems.STORE_UNAVAILABLE() from error
 
-    def _publish_later(self, publish: Callable[[], None]) -> None:
-        """Publish files without waiting for the file store."""
-        self._pending.append(self._files.submit(publish))
-
     def _check_published(self) -> None:
         """Raise the error of publishing that has failed."""
         while self._pending and self._pending[0].done():
@@ -312,9 +298,9 @@ class RunningAttempt:
         spec = job_spec(layout(self.lease.job.inputs)[0], stored_parameters(self.lease.job.parameters))
         if self.grant.gpus:
             self._store.leases.hold_gpus(self.lease, len(self.grant.gpus))
-        prepare = partial(self._stager.prepare, self._folder, self.lease, self.grant, spec)
+        prepare = partial(self._prepare, self._folder, self.lease, self.grant, spec)
         self._within(prepare, size=sum(entry["size"] for entry in self.lease.job.inputs))
-        self._process = ChildProcess(self._folder, self.grant, cluster=self._stager.cluster)
+        self._process = ChildProcess(self._folder, self.grant, cluster=self._cluster)
         _log.info("attempt started", extra=self.lease.log_fields)
         reported = self._watch(self._process)
         if self._stop_request == StopRequest.ABANDON:
@@ -329,7 +315,7 @@ class RunningAttempt:
             exit_code,
             self._within(self._publisher.log_tail),
             has_result=self._within(self._publisher.has_result),
-            cluster=self._stager.cluster,
+            cluster=self._cluster,
         )
         self._conclude(ending)
 
@@ -368,7 +354,7 @@ class RunningAttempt:
             self._progress.write()
             self._check_published()
             if not self._pending:
-                self._publish_later(self._publisher.publish_unfinished)
+                self._pending.append(self._files.submit(self._publisher.publish_unfinished))
             if self._finish_requested:
                 process.finish()
             if self._stop_request is not None:
@@ -380,7 +366,7 @@ class RunningAttempt:
     def _handle(self, report: Report) -> None:
         """Handle a report, except for its ending."""
         if report.stored is not None:
-            self._publish_later(partial(self._publisher.publish, [report.stored]))
+            self._pending.append(self._files.submit(self._publisher.publish, [report.stored]))
         if report.prepared:
             self._store.leases.start(self.lease)
         if report.progress is not None:

@@ -20,7 +20,7 @@ import math
 import os
 import socket
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from service.inputs import JobParameters, stored_parameters
@@ -153,19 +153,17 @@ class Capacity:
         """Number of GPUs, or of slots without GPUs."""
         return len(self._machine.gpus) or self._slots
 
-    def free(self, held: Iterable[Grant]) -> int:
+    def free(self, held: Sequence[Grant]) -> int:
         """Return the free portion of `size`."""
-        held = list(held)
         return len(self._free_gpus(held)) if self._machine.gpus else self._free_slots(held)
 
-    def grant(self, job: JobRow, held: Iterable[Grant], waiting: int) -> Grant | None:
+    def grant(self, job: JobRow, held: Sequence[Grant], waiting: int) -> Grant | None:
         """Return the capacity that a job gets beside the running jobs; None if it has to wait.
 
         Args:
             held: Capacity of running jobs.
             waiting: Number of jobs that this machine could start now, including this one.
         """
-        held = list(held)
         slots = self._free_slots(held)
         if slots < 1:
             return None
@@ -176,15 +174,15 @@ class Capacity:
             return self._on_gpus(parameters.workers, seconds, scene, held, min(max(waiting, 1), slots))
         return self._on_cores(parameters.workers or 1, settings.memory_limit, scene, slots)
 
-    def _free_gpus(self, held: list[Grant]) -> list[str]:
+    def _free_gpus(self, held: Sequence[Grant]) -> list[str]:
         taken = {gpu for grant in held for gpu in grant.gpus}
         return [gpu for gpu in self._machine.gpus if gpu not in taken]
 
-    def _free_slots(self, held: list[Grant]) -> int:
+    def _free_slots(self, held: Sequence[Grant]) -> int:
         return self._slots - sum(grant.slots for grant in held)
 
     def _on_gpus(
-        self, requested: int | None, seconds: float, scene: int, held: list[Grant], sharers: int
+        self, requested: int | None, seconds: float, scene: int, held: Sequence[Grant], sharers: int
     ) -> Grant | None:
         free = self._free_gpus(held)
         if requested:

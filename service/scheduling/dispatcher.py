@@ -15,18 +15,18 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from service.files.blobs import open_blobs
 from service.files.objects import Artifacts
 from service.problems import DamagedWeightsError, DatabaseUnavailableError
-from service.scheduling.attempts import RunningAttempt, Stager
+from service.scheduling.attempts import RunningAttempt, prepare
 from service.scheduling.capacity import Capacity, Grant, Machine, is_dead, own_name
-from service.scheduling.housekeeping import Housekeeper
+from service.scheduling.housekeeping import clean_up, remove_orphans
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings, check_weights, start
 from service.store import Store, open_store
 from service.store.queue import Lease
-from service.store.tables import JobRow
 
 #: Fractions of a lease's duration: the age at which a lease is renewed, and the age at which its job is killed if
 #: renewing has failed. The latter is below 1, because other dispatchers may take an expired lease and clocks differ.
@@ -50,20 +50,14 @@ def lease_next_job(
         return None  # without a query, which would lock rows that other dispatchers want
     dispatchers = max(1, len(store.operations.dispatchers()))
     waiting = -(-store.leases.waiting(capacity.size * dispatchers) // dispatchers)  # others take their portion
-    grants: dict[str, Grant] = {}
-
-    def fits(job: JobRow) -> bool:
-        grant = capacity.grant(job, held, waiting)
-        if grant is not None:
-            grants[job.id] = grant
-        return grant is not None
-
-    lease = store.leases.take(dispatcher, fits) if waiting else None
-    return (lease, grants[lease.job_id]) if lease is not None else None
+    grant = partial(capacity.grant, held=held, waiting=waiting)
+    lease = store.leases.take(dispatcher, lambda job: grant(job) is not None) if waiting else None
+    granted = grant(lease.job) if lease is not None else None
+    return (lease, granted) if lease is not None and granted is not None else None
 
 
-#: Intervals between rounds of housekeeping, and of sending webhooks, in seconds.
-_HOUSEKEEPING_SECONDS, _WEBHOOK_SECONDS = 60.0, 2.0
+#: Intervals between rounds of housekeeping, of searching for orphaned files, and of sending webhooks, in seconds.
+_HOUSEKEEPING_SECONDS, _SEARCH_SECONDS, _WEBHOOK_SECONDS = 60.0, 3600.0, 2.0
 #: Delay before the next pass after one has failed, in seconds.
 _OUTAGE_SECONDS = 2.0
 #: Interval between checks of ending attempts during the shutdown, in seconds.
@@ -88,12 +82,14 @@ class Dispatcher:
         self._announced_at = self._renewed_at = float("-inf")
         self._stop, self._ended = threading.Event(), threading.Event()
         blobs = open_blobs(settings, store.inputs, self._artifacts)
-        self._stager = Stager(settings, store, blobs, self._artifacts, cluster=machine.cluster)
+        self._cluster = machine.cluster
+        self._prepare = partial(prepare, settings, store, blobs, self._artifacts, self._cluster)
         #: Periodic work in threads of its own, because it may wait for the database, files or receivers: name,
         #: interval in seconds, and function.
         self._helpers = [
             ("lease-keeper", _CHECK_FRACTION * settings.lease_seconds, self._abandon_late),
-            ("housekeeper", _HOUSEKEEPING_SECONDS, Housekeeper(store, self._artifacts, blobs).clean_up),
+            ("housekeeper", _HOUSEKEEPING_SECONDS, partial(clean_up, store, self._artifacts, blobs)),
+            ("orphan-search", _SEARCH_SECONDS, partial(remove_orphans, store, self._artifacts, blobs)),
         ]
         if settings.webhooks:
             self._helpers.append(("webhooks", _WEBHOOK_SECONDS, Deliverer(settings, store).deliver_due))
@@ -160,9 +156,16 @@ class Dispatcher:
                 return
             lease, grant = taken
             folder = self._work / f"{lease.job_id}-{lease.epoch}"
-            attempt = RunningAttempt(lease, grant, folder, self._settings, self._store, self._artifacts, self._stager)
-            self._running[lease.job_id] = attempt
-            attempt.start()
+            self._running[lease.job_id] = RunningAttempt(
+                lease,
+                grant,
+                folder,
+                self._settings,
+                self._store,
+                self._artifacts,
+                self._prepare,
+                self._cluster,
+            )
 
     def _update_leases(self) -> None:
         """Renew all leases if that is due, and pass the statuses of the jobs to their attempts; abandon lost jobs."""

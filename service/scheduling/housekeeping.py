@@ -8,7 +8,6 @@ running.
 from __future__ import annotations
 
 import secrets
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,33 +28,26 @@ from service.store import Store
 from service.store.files import BLOBS, UPLOADS
 from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, UploadRow
 
-#: Interval between searches for orphaned files, in seconds.
-_SEARCH_SECONDS = 3600.0
 #: Maximum number of jobs whose leftover files are looked for at a time.
 _MAX_SWEEPS = 20
 #: Description of a file.
 What = Literal["input", "result", "checkpoint", "upload"]
 
 
-class Housekeeper:
-    """Periodic housekeeping by a dispatcher."""
+def clean_up(store: Store, artifacts: Artifacts, blobs: Blobs) -> None:
+    """Delete what has expired, and leftovers of attempts at ended jobs."""
+    for job_id in store.jobs.expire():
+        artifacts.objects.remove_below(job_id)
+    while ended := store.jobs.unswept(_MAX_SWEEPS):
+        for job_id, epoch in ended:
+            sweep(store, artifacts, job_id, epoch)
+    blobs.collect()
 
-    def __init__(self, store: Store, artifacts: Artifacts, blobs: Blobs) -> None:
-        self._store, self._artifacts, self._blobs = store, artifacts, blobs
-        self._searched_at = float("-inf")
 
-    def clean_up(self) -> None:
-        """Delete what has expired, and from time to time orphaned files."""
-        for job_id in self._store.jobs.expire():
-            self._artifacts.objects.remove_below(job_id)
-        while ended := self._store.jobs.unswept(_MAX_SWEEPS):
-            for job_id, epoch in ended:
-                sweep(self._store, self._artifacts, job_id, epoch)
-        self._blobs.collect()
-        if time.monotonic() - self._searched_at > _SEARCH_SECONDS:
-            self._searched_at = time.monotonic()
-            for objects, _, name in orphans(self._store, self._artifacts, self._blobs):
-                objects.remove(name)
+def remove_orphans(store: Store, artifacts: Artifacts, blobs: Blobs) -> None:
+    """Delete orphaned files."""
+    for objects, _, name in orphans(store, artifacts, blobs):
+        objects.remove(name)
 
 
 def orphans(store: Store, artifacts: Artifacts, blobs: Blobs) -> Iterator[tuple[ObjectStore, What, str]]:

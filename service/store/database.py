@@ -31,8 +31,10 @@ _PROBE_SECONDS = 0.2
 _BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "40", "55")
 #: The same for errors that concern a statement or its values, so they are bugs of the service. All others are outages,
 #: in whatever words: a server that is a standby, shuts down, or has no memory or connections left.
-_BUGS = (*(f"SQLITE_{each}" for each in ("CONSTRAINT", "ERROR", "MISMATCH", "MISUSE", "RANGE", "TOOBIG")),)
-_BUGS += ("21", "22", "23", "42", "44", "54")
+_BUGS = (
+    *(f"SQLITE_{each}" for each in ("CONSTRAINT", "ERROR", "MISMATCH", "MISUSE", "RANGE", "TOOBIG")),
+    *("21", "22", "23", "42", "44", "54"),
+)
 #: Names of SQLite's and codes of PostgreSQL's errors for rows that refer to a missing one or exist already.
 _CHANGED = (*(f"SQLITE_CONSTRAINT_{each}" for each in ("FOREIGNKEY", "PRIMARYKEY", "UNIQUE")), "23503", "23505")
 
@@ -115,8 +117,8 @@ def _refusal(error: Exception) -> ServiceError | None:
     return problems.DATABASE_UNAVAILABLE() if away or getattr(error, "connection_invalidated", False) else None
 
 
-def _impatient_connection(seconds: float) -> Any:
-    """Return a subclass of psycopg's connection that bounds each wait for the server.
+def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, seconds: float) -> Any:
+    """Connect to PostgreSQL with bounded waits.
 
     A stopped server or a frozen machine still acknowledges packets, so no TCP timeout detects it.
     """
@@ -134,7 +136,7 @@ def _impatient_connection(seconds: float) -> Any:
                     self.pgconn.finish()  # a late response would be taken for that of another query
                 raise
 
-    return ImpatientConnection
+    return ImpatientConnection.connect(*arguments, **options)
 
 
 Clock = Callable[[], float]
@@ -302,21 +304,14 @@ class Database:
 
     @contextmanager
     def _upgrading(self, engine: Engine) -> Iterator[None]:
-        if self.sqlite and self.url.database:
-            with Path(self.url.database).with_suffix(".lock").open("w") as file:
+        if self.sqlite:
+            with Path(str(self.url.database)).with_suffix(".lock").open("w") as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
                 yield
-        elif self.sqlite:
-            yield
         else:
             with engine.begin() as connection:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
                 yield
-
-
-def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, seconds: float) -> Any:
-    """Connect to PostgreSQL with bounded waits."""
-    return _impatient_connection(seconds).connect(*arguments, **options)
 
 
 def _set_pragmas(connection: Any, _record: Any, *, busy_seconds: float) -> None:

@@ -207,21 +207,6 @@ def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
     session.execute(upsert(session)(_POINTS).values(values).on_conflict_do_nothing())
 
 
-def _points(connection: Connection, job_id: str, current: dict[str, Any] | None, most: int) -> list[dict[str, Any]]:
-    """Return a job's loss history: its points, and its current progress as the last one, as in `add_point`.
-
-    Args:
-        current: Current progress of the job; ignored if it is None or has no loss.
-        most: Maximum number of points, at least 2; longer histories are sampled evenly, including both ends.
-    """
-    known: list[dict[str, Any]] = list(connection.execute(_ALL, {"job_id": job_id}).scalars())
-    if current and _is_step(current) and (not known or _position(current) > _position(known[-1])):
-        known.append(current)
-    if len(known) > most:
-        known = [known[number * (len(known) - 1) // (most - 1)] for number in range(most)]
-    return known
-
-
 def _is_step(progress: dict[str, Any]) -> bool:
     return progress.get("loss") is not None and progress.get("seconds") is not None
 
@@ -273,10 +258,9 @@ def _queries(dialect: str) -> dict[str, TextClause]:
         "page": f"SELECT number, value FROM (SELECT {position} AS position, {value} AS value, {index} AS number "
         f"{of_jobs}) AS entries WHERE position >= :start ORDER BY position LIMIT :most",
     }
-    lists = {name: [each for each in ("ids", "roles") if f":{each}" in text_] for name, text_ in texts.items()}
     return {
-        name: text(text_).bindparams(*(bindparam(each, expanding=True) for each in lists[name]))
-        for name, text_ in texts.items()
+        name: text(sql).bindparams(*(bindparam(each, expanding=True) for each in ("ids", "roles") if f":{each}" in sql))
+        for name, sql in texts.items()
     }
 
 
@@ -640,9 +624,19 @@ class Jobs:
         return unused
 
     def loss_history(self, job: JobRow, most: int) -> list[dict[str, Any]]:
-        """Return a job's loss history up to its current step, in at most `most` points."""
+        """Return a job's loss history: its points, and its current progress as the last one, as in `add_point`.
+
+        Args:
+            most: Maximum number of points, at least 2; longer histories are sampled evenly, including both ends.
+        """
         with self._database.reading_rows() as connection:
-            return _points(connection, job.id, job.progress, most)
+            known: list[dict[str, Any]] = list(connection.execute(_ALL, {"job_id": job.id}).scalars())
+        current = job.progress
+        if current and _is_step(current) and (not known or _position(current) > _position(known[-1])):
+            known.append(current)
+        if len(known) > most:
+            known = [known[number * (len(known) - 1) // (most - 1)] for number in range(most)]
+        return known
 
     def events(self, job_id: str, after: int, limit: int = 500) -> list[EventRow]:
         """Return a job's events after the event number `after`."""

@@ -296,14 +296,12 @@ class Leases:
     def renew(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
         """Renew leases; return the status of each job, or None if its lease is lost."""
         until = self._database.clock() + self._seconds
-        statuses: dict[str, JobStatus | None] = {}
         with self._database.writing() as session:
             for lease in sorted(leases, key=lambda each: each.job_id):
                 job = self._leased_job(session, lease)
                 if job is not None:
                     job.lease_expires_at = until
-                statuses[lease.job_id] = JobStatus(job.status) if job is not None else None
-        return statuses
+        return self.statuses(leases)
 
     def statuses(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
         """Return what `renew` returns, without renewing the leases."""

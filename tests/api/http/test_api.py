@@ -25,7 +25,7 @@ from api.cli.options import kind_of
 from service.files.blobs import BlobFolder
 from service.files.objects import Artifacts
 from service.inputs import JobParameters
-from service.scheduling.housekeeping import Housekeeper
+from service.scheduling.housekeeping import remove_orphans
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -464,11 +464,11 @@ def test_partial_files_of_dead_process_are_removed(tmp_path: Path, monkeypatch: 
     blobs, artifacts = BlobFolder(tmp_path, store.inputs, 0), Artifacts(f"file://{tmp_path / 'artifacts'}")
     half = blobs.incoming / "half.part"
     half.write_bytes(b"x")
-    Housekeeper(store, artifacts, blobs).clean_up()
+    remove_orphans(store, artifacts, blobs)
     assert half.exists(), "it may still be written to"
     # no file's age can be made up: it is that of its name
     monkeypatch.setattr("service.files.objects.ORPHAN_SECONDS", -1.0)
-    Housekeeper(store, artifacts, blobs).clean_up()
+    remove_orphans(store, artifacts, blobs)
     assert not half.exists()
     store.close()
 

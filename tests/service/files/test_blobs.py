@@ -18,7 +18,7 @@ from service import problems
 from service.files.blobs import BlobFolder, Receiver, StoredBlobs, write_all
 from service.files.objects import Artifacts, ObjectStore
 from service.problems import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
-from service.scheduling.housekeeping import Housekeeper
+from service.scheduling.housekeeping import clean_up, remove_orphans
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.files import InputRows
@@ -162,11 +162,13 @@ def test_unused_blobs_are_collected(fleet: Fleet, monkeypatch: pytest.MonkeyPatc
     sha256 = fleet.take(host, b"wanted by nobody")
     fleet.objects.put(_file(fleet.folder, b"x"), "blobs/aa/orphan")
     fleet.objects.put(_file(fleet.folder, b"x"), "uploads/upl_1/orphan")
-    Housekeeper(fleet.store, Artifacts(fleet.url), host).clean_up()
+    for work in (clean_up, remove_orphans):
+        work(fleet.store, Artifacts(fleet.url), host)
     assert len(fleet.names()) == 3, "the rows may still be on their way"
     monkeypatch.setattr("service.files.objects.REMOTE_ORPHAN_SECONDS", -HOUR)
     fleet.store.inputs.database.clock = lambda: 10**11
-    Housekeeper(fleet.store, Artifacts(fleet.url), fleet.host("two")).clean_up()
+    for work in (clean_up, remove_orphans):
+        work(fleet.store, Artifacts(fleet.url), fleet.host("two"))
     assert fleet.names() == []
     with pytest.raises(NotFoundError):
         fleet.store.inputs.hold([sha256])

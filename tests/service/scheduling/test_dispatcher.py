@@ -137,9 +137,6 @@ def test_attempt_is_abandoned_before_an_unrenewed_lease_expires(
         def __init__(self, lease: Lease, grant: Grant, *others: object) -> None:
             self.lease, self.grant, self.alive, self.abandoned = lease, grant, True, False
 
-        def start(self) -> None:
-            """Start nothing."""
-
         def obey(self, status: str) -> None:
             """Ignore requests."""
 
