@@ -642,15 +642,12 @@ async def create_job(
             return await asyncio.to_thread(queue_job, idempotency, receipt)
         stack.pop_all()  # keep the files, which planning needs after this function returns
 
-    checked = asyncio.Event()
-    checked.set()
-
     async def plan(show: Show) -> PlanView:
         async with receipt:
             findings = await context.inspector.inspect("plan", caller.owner, inputs, rows, parameters, show)
         return PlanView(**findings, workers=parameters.workers)
 
-    return await answer_work(request, plan, "planning", "plan", context.hub.working, checked)
+    return await answer_work(request, plan, "planning", "plan", context.hub.working)
 
 
 def _find_inputs(
