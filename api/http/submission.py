@@ -756,18 +756,15 @@ def _resolve_inputs(
     for _, role, text in received.uploads:
         if is_url(text):
             resolved.append((file_name(text), fetched.get(text, "")))
-            continue
-        if text in fetched:
+        elif text in fetched:
             resolved.append((RESULT, fetched[text]))
-            continue
-        if reference := _PATH.fullmatch(text.removeprefix(subpath.get())):
+        elif reference := _PATH.fullmatch(text.removeprefix(subpath.get())):
             entry = _referred_input(context, caller, reference[1], reference[2], role, released)
             resolved.append((entry["name"], entry["sha256"]))
-            continue
-        upload = uploads.get(text)
-        if upload is None:
+        elif upload := uploads.get(text):
+            resolved.append((uploaded_name(upload.metadata_header), _upload_digest(context, upload, role)))
+        else:
             raise problems.UNKNOWN_UPLOAD(upload_id=text[:60], input=role)
-        resolved.append((uploaded_name(upload.metadata_header), _upload_digest(context, upload, role)))
     digests = {sha256 for _, sha256 in resolved} | {entry["sha256"] for entry in inputs}
     rows = context.store.inputs.hold(sorted(filter(None, digests)))
     for number, ((index, role, _), (filename, sha256)) in enumerate(zip(received.uploads, resolved, strict=True)):
