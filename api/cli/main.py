@@ -222,7 +222,3 @@ def _print_error(arguments: Sequence[str], code: str, detail: str, problem: Mapp
         print(json.dumps({"code": code, "detail": detail, **(problem or {})}), file=sys.stderr)
     else:
         error_console.print(f"error: {detail}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())
