@@ -24,13 +24,13 @@ from typing import Any, Self, TypeVar
 
 import httpx2
 from fastapi import Request
-from pydantic import BaseModel
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, MultipartState, parse_options_header
 from starlette.requests import ClientDisconnect
 
 from api.http.context import memory
 from api.http.problems import raises
+from api.http.schemas import Model
 from service import problems
 from service.deadlines import FileThreads, OwnerLimit
 from service.files.blobs import Blobs, Receiver
@@ -162,7 +162,6 @@ _LEAST_RATE = 1000
 _DRAIN_BYTES, _DRAIN_SECONDS = 64 << 20, 10.0
 
 
-Model = TypeVar("Model", bound=BaseModel)
 Value = TypeVar("Value")
 
 
