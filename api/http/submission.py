@@ -32,7 +32,6 @@ from api.http.receiving import (
     Received,
     body_blocks,
     check_media_type,
-    check_size,
     file_name,
     is_url,
     media_type,
@@ -627,8 +626,6 @@ async def create_job(
         recall = partial(context.inspector.recall, "validate", caller.owner, inputs, parameters)
         findings = await context.threads.run(caller.owner, recall)
         if findings is None:
-            for entry in inputs:
-                check_size(entry["role"], entry["name"], entry["size"])
             findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
             up, foreign = (findings["up"], findings["foreign"]) if sure_up else (None, None)
