@@ -176,8 +176,6 @@ def _run(invocation: Invocation) -> int:
     try:
         code = app(args=arguments, prog_name="sgsst", obj=invocation, standalone_mode=False)
         return code if isinstance(code, int) else 0
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
     except _UsageError as error:
         error.message = error.message.removeprefix("Value error, ")  # typer validates words with pydantic
         if "--json" in arguments:
