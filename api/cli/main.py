@@ -156,16 +156,9 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, and return its exit code. A command that fails leaves no empty folders for its outputs."""
+    """Run the command line, and return its exit code."""
     started = process_start() if arguments is None else time.time()
-    invocation = Invocation(sys.argv[1:] if arguments is None else list(arguments), started)
-    code = FAILURE
-    try:
-        code = _run(invocation)
-    finally:
-        if code:
-            invocation.remove_empty_folders()
-    return code
+    return _run(Invocation(sys.argv[1:] if arguments is None else list(arguments), started))
 
 
 def _run(invocation: Invocation) -> int:
