@@ -38,27 +38,24 @@ def _filled(content: bytes, tables: dict[bytes, bytes]) -> bytes:
 
 def _tables() -> dict[str, object]:
     """Return the tables of the server that modules contain, by the names of their placeholders."""
-    formats = [
-        {
-            "name": each.name,
-            "suffix": each.suffix,
-            "title": each.title,
-            "result": each in RESULT_FORMATS,
-        }
-        for each in FORMATS
-    ]
-    downloads = [{"name": name, "title": title} for name, title in DOWNLOADS.items()]
-    actions = [
-        {"name": name, "title": name.capitalize(), "statuses": action.statuses} for name, action in ACTIONS.items()
-    ]
-    groups = {"unfinished": UNFINISHED, "working": WORKING, "stepping": STEPPING}
-    states = {"titles": TITLES, **groups, "actions": actions}
     return {
-        "scene_formats": formats,
-        "downloads": downloads,
+        "scene_formats": [
+            {"name": each.name, "suffix": each.suffix, "title": each.title, "result": each in RESULT_FORMATS}
+            for each in FORMATS
+        ],
+        "downloads": [{"name": name, "title": title} for name, title in DOWNLOADS.items()],
         "installed_extras": installed_extras(),
         "strengths": STRENGTHS,
-        "job_states": states,
+        "job_states": {
+            "titles": TITLES,
+            "unfinished": UNFINISHED,
+            "working": WORKING,
+            "stepping": STEPPING,
+            "actions": [
+                {"name": name, "title": name.capitalize(), "statuses": action.statuses}
+                for name, action in ACTIONS.items()
+            ],
+        },
     }
 
 

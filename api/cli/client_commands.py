@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path, PureWindowsPath
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import Annotated, Any, get_args
 
 import typer
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn
 from rich.table import Column, Table
+from stamina.instrumentation import RetryDetails, set_on_retry_hooks
 
 from api.cli import INTERRUPTED
 from api.cli.console import (
@@ -29,11 +30,11 @@ from api.cli.options import (
     SubmittedArguments,
     cameras_of,
     file_to_write,
-    path_to_write,
     with_arguments,
     with_options,
 )
-from api.client.client import different_names
+from api.client.client import Client, different_names
+from api.client.transport import Job
 from service.inputs import JobParameters
 from service.states import ACTIONS, STEPPING, Transition, WebhookEvent
 from sgsst_core.errors import OutputError, SettingsError
@@ -47,12 +48,6 @@ from sgsst_core.files.formats import (
 from sgsst_core.progress import Progress, duration, live_bar
 from worker.job import check_file, check_folder, check_is_not_input
 from worker.options import ESSENTIALS, RegionOptions, parse_styles, path_or_url, region_requests, split_weight
-
-if TYPE_CHECKING:
-    from stamina.instrumentation import RetryDetails
-
-    from api.client import Client
-    from api.client.transport import Job
 
 UrlOption = Annotated[
     str | None, typer.Option("--url", help="URL of the service. [default: SGSST_URL, else http://127.0.0.1:8000]")
@@ -195,7 +190,6 @@ def download(
         Path | None,
         typer.Option(
             help="File to write, whose ending is the format of stylized.ply, or folder for 'all'. [default: NAME]",
-            callback=path_to_write,
         ),
     ] = None,
     overwrite: Annotated[
@@ -350,11 +344,7 @@ ACTION_COMMANDS = {action.value: _command_of(action) for action in ACTIONS}
 
 def open_client(url: str | None, key: str | None) -> Client:
     """Return a client that prints its retries."""
-    import stamina.instrumentation
-
-    from api.client import Client
-
-    stamina.instrumentation.set_on_retry_hooks([_print_retry])
+    set_on_retry_hooks([_print_retry])
     return Client(url, key)
 
 

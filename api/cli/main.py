@@ -156,16 +156,9 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, and return its exit code. A command that fails leaves no empty folders for its outputs."""
+    """Run the command line, and return its exit code."""
     started = process_start() if arguments is None else time.time()
-    invocation = Invocation(sys.argv[1:] if arguments is None else list(arguments), started)
-    code = FAILURE
-    try:
-        code = _run(invocation)
-    finally:
-        if code:
-            invocation.remove_empty_folders()
-    return code
+    return _run(Invocation(sys.argv[1:] if arguments is None else list(arguments), started))
 
 
 def _run(invocation: Invocation) -> int:
@@ -176,8 +169,6 @@ def _run(invocation: Invocation) -> int:
     try:
         code = app(args=arguments, prog_name="sgsst", obj=invocation, standalone_mode=False)
         return code if isinstance(code, int) else 0
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
     except _UsageError as error:
         error.message = error.message.removeprefix("Value error, ")  # typer validates words with pydantic
         if "--json" in arguments:
@@ -222,7 +213,3 @@ def _print_error(arguments: Sequence[str], code: str, detail: str, problem: Mapp
         print(json.dumps({"code": code, "detail": detail, **(problem or {})}), file=sys.stderr)
     else:
         error_console.print(f"error: {detail}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

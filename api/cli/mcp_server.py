@@ -21,7 +21,7 @@ from pydantic import Field
 
 from api import installed_version
 from api.client import AsyncClient
-from api.client.client import IMAGE_SUFFIXES, JobFiles, input_files
+from api.client.client import IMAGE_SUFFIXES, input_files
 from api.client.transport import Job
 from service.inputs import JobParameters
 from sgsst_core.errors import SgsstError
@@ -168,15 +168,18 @@ class Tools:
 
     def _files(self, scene: str, style: list[str], cameras: str | None, photos: str | None) -> dict[str, Any]:
         """Return the files of a job as arguments of the client, after checking each of them."""
+        files: dict[str, Any] = {
+            "scene": self._input(scene),
+            "cameras": self._input(cameras) if cameras else None,
+            "photos": self._inside(photos) if photos else None,
+        }
         styles = [self._input(each) for each in style]
-        folder = self._inside(photos) if photos else None
-        files = JobFiles(self._input(scene), styles, self._input(cameras) if cameras else None, folder)
-        for file in input_files(files):
+        for file in input_files(**files, styles=styles, masks={}, painted=()):
             if isinstance(file.source, Path):
                 self._inside(file.source)
                 if not file.name.lower().endswith(_SUFFIXES[file.role]):
                     raise ToolError(f"{file.source}: does not end in {', '.join(_SUFFIXES[file.role])}.")
-        return {"scene": files.scene, "style": styles, "cameras": files.cameras, "photos": files.photos}
+        return {**files, "style": styles}
 
     def _input(self, text: str) -> str | Path:
         """Return a URL as it is, or the path of a file or folder below the root."""

@@ -27,7 +27,6 @@ from api.cli.options import (
     file_to_write,
     folder_to_write,
     path_to_read,
-    path_to_write,
     source_of,
     with_arguments,
     with_options,
@@ -48,7 +47,6 @@ from worker.options import (
 
 if TYPE_CHECKING:
     from sgsst_core.bench.variants import Curve
-    from worker.derived import VideoRequest
 
 
 @with_options(StylizeOptions, without=("workers",))
@@ -124,7 +122,6 @@ def render(
         typer.Option(
             help="Video to write instead: a .mp4 file (H.264), a .webm file (VP9), a folder or a pattern such as "
             "frame_%04d.png for PNG images.",
-            callback=path_to_write,
             rich_help_panel=ESSENTIALS,
         ),
     ] = None,
@@ -167,9 +164,14 @@ def render(
     around = video is not None and video_options.path == "orbit"
     source = (SceneRequest.of if around else source_of)(scene, cameras, options)
     if video is not None:
-        from worker.derived import VideoRequest
+        from worker.derived import VideoRequest, check_video_request, render_video
 
-        _render_video(VideoRequest(source, video, video_options, background, compare, transparent))
+        request = VideoRequest(source, video, video_options, background, compare, transparent)
+        check_video_request(request)
+        with _frame_bar() as progress:
+            shown = render_video(request, progress, _print_warning)
+        fps, size = video_options.fps, f"{shown[0].width}x{shown[0].height}"
+        out_console.print(f"{len(shown)} frames of {size}, {len(shown) / fps:.3g} s at {fps} per second, in {video}")
     elif given:
         raise SettingsError(f"--{given[0]} requires --video. Add it, or omit --{given[0]}.")
     elif panorama is not None:
@@ -184,16 +186,6 @@ def render(
         with _frame_bar() as progress:
             paths = render_views(source, background, out, progress, _print_warning)
         out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
-
-
-def _render_video(request: VideoRequest) -> None:
-    from worker.derived import check_video_request, render_video
-
-    check_video_request(request)
-    with _frame_bar() as progress:
-        cameras = render_video(request, progress, _print_warning)
-    frames, fps, size = len(cameras), request.options.fps, f"{cameras[0].width}x{cameras[0].height}"
-    out_console.print(f"{frames} frames of {size}, {frames / fps:.3g} s at {fps} per second, in {request.out}")
 
 
 def _print_warning(line: str) -> None:

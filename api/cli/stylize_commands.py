@@ -379,20 +379,20 @@ def batch(
         raise SettingsError(f"{option}: is for results that this machine makes. Omit it, or --url.")
     results = _Batch(out)
     jobs = {}
-    pairs = list(itertools.product(zip(_names(scenes), scenes, strict=True), zip(_names(style), style, strict=True)))
+    named = (zip(different_names([*map(_namesake, paths)]), paths, strict=True) for paths in (scenes, style))
+    pairs = list(itertools.product(*named))
     names = different_names([Path(f"{scene_name}_{style_name}") for (scene_name, _), (style_name, _) in pairs])
     for name, ((_, scene), (_, image)) in zip(names, pairs, strict=True):
         inputs = JobArguments(str(scene), [str(image)], str(cameras) if cameras else None)
         jobs[name] = inputs.request(options, results.result(name))
         for each in scenes:
             check_is_not_input(results.result(name), scene_path(each), "scene of another result")
-    invocation: Invocation = context.obj
     if url is not None:
         _make_by_service(results, jobs, options, url, key)
     else:
         for name, request in jobs.items():
             with results.attempt(name):
-                _make(results, name, request, options, run, invocation)
+                _make(results, name, request, options, run, context.obj)
     if any(request.out.is_file() for request in jobs.values()):
         _write_sheet(out / _SHEET, jobs, len(style))
         print_field("contact sheet", out / _SHEET)
@@ -403,12 +403,9 @@ def batch(
         raise typer.Exit(FAILURE)
 
 
-def _names(paths: Sequence[Path]) -> list[str]:
-    """Return the parts that files have in the names of results."""
-    from api.client.client import different_names
-
-    plain = [scene_path(path).parent if scene_path(path) != path else path.with_suffix("") for path in paths]
-    return different_names(plain)
+def _namesake(path: Path) -> Path:
+    """Return the path whose name the results of a file have: the folder of an unpacked scene, else without suffix."""
+    return scene_path(path).parent if scene_path(path) != path else path.with_suffix("")
 
 
 def _make(

@@ -18,7 +18,7 @@ import secrets
 import tempfile
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar, cast
@@ -134,9 +134,7 @@ class AsyncClient:
         Raises:
             RequestError: If an input cannot be used; the message says which and why.
         """
-        files = _files(scene, style, cameras, photos, masks, painted)
-        parameters |= {"painted": [*painted.values()]} if painted else {}
-        fields = await _send_files(self._transport, files, parameters, progress)
+        fields = await self._send(parameters, progress, scene, style, cameras, photos, masks, painted)
         given = {"webhook": webhook, "webhook_events": ",".join(webhook_events)}
         fields += [(name, (None, value)) for name, value in given.items() if value]
         headers = {"Idempotency-Key": secrets.token_hex(16)}
@@ -161,10 +159,37 @@ class AsyncClient:
         Args:
             planning: Callback that receives the number of completed views of the survey, and of all.
         """
-        files = _files(scene, style, cameras, photos, masks, painted)
-        parameters |= {"painted": [*painted.values()]} if painted else {}
-        fields = await _send_files(self._transport, files, parameters, progress)
+        fields = await self._send(parameters, progress, scene, style, cameras, photos, masks, painted)
         return await self._transport.work("/v1/jobs", "planning", planning, params={"dry_run": True}, files=fields)
+
+    async def _send(
+        self,
+        parameters: dict[str, Any],
+        progress: Progress,
+        scene: str | Path,
+        style: str | Path | Sequence[str | Path],
+        cameras: str | Path | None,
+        photos: str | Path | None,
+        masks: Mapping[str, str | Path] | None,
+        painted: Mapping[str | Path, Mapping[str, Any]] | None,
+    ) -> list[tuple[str, Any]]:
+        """Upload the large files of a job, and return the form fields of its request, which hold all else."""
+        parameters |= {"painted": [*painted.values()]} if painted else {}
+        given = json_text({name: value for name, value in parameters.items() if value is not None})
+        styles = [style] if isinstance(style, str | Path) else style
+        with tempfile.TemporaryDirectory() as folder:
+            packed = await in_thread(_packed, path_or_url(scene), Path(folder))
+            inputs = await in_thread(
+                input_files,
+                packed,
+                [path_or_url(each) for each in styles],
+                None if cameras is None else path_or_url(cameras),
+                None if photos is None else Path(photos),
+                {name: Path(path) for name, path in (masks or {}).items()},
+                [Path(path) for path in painted or ()],
+            )
+            fields = await _sent(self._transport, inputs, progress)
+        return [*fields, ("parameters", (None, given))]
 
     async def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> str:
         """Upload a file in parts, and return the upload's id. Any number of jobs may use the upload."""
@@ -280,8 +305,7 @@ class AsyncClient:
         """
         parts = [{"job_id": other, "weight": each} for other, each in (others or {}).items()]
         body = {"weight": weight, "others": parts, "format": format}
-        name: str = (await self._transport.call("POST", f"{_job_path(job_id)}/blends", json=body)).json()["name"]
-        return name
+        return str((await self._transport.call("POST", f"{_job_path(job_id)}/blends", json=body)).json()["name"])
 
     async def video(self, /, job_id: str, progress: Progress = no_progress, **options: Any) -> str:
         """Render a video of a finished job's result, and return its name for `download`. It takes minutes.
@@ -295,8 +319,7 @@ class AsyncClient:
             RequestError: If the job has no result, or an option is invalid.
         """
         video = await self._transport.work(f"{_job_path(job_id)}/video", "rendering", progress, json=options)
-        name: str = video["name"]
-        return name
+        return str(video["name"])
 
     async def usage(self, since: str | None = None, until: str | None = None) -> list[dict[str, Any]]:
         """Return the usage of the key by day; with an operator's key, or without keys, that of all keys.
@@ -306,8 +329,7 @@ class AsyncClient:
             until: Last day; None for today.
         """
         days = {name: day for name, day in (("since", since), ("until", until)) if day is not None}
-        usage: list[dict[str, Any]] = (await self._transport.call("GET", "/v1/usage", params=days)).json()["usage"]
-        return usage
+        return list((await self._transport.call("GET", "/v1/usage", params=days)).json()["usage"])
 
     async def act(self, job_id: str, action: str) -> Job:
         """Request an action on a job by its name in `service.states.ACTIONS`."""
@@ -354,25 +376,6 @@ def _job_path(job_id: str) -> str:
     if not _ID.fullmatch(job_id):
         raise RequestError(f"There is no job {job_id!r}. `sgsst jobs` lists the IDs of jobs.", 404)
     return f"/v1/jobs/{job_id}"
-
-
-def _files(
-    scene: str | Path,
-    style: str | Path | Sequence[str | Path],
-    cameras: str | Path | None,
-    photos: str | Path | None,
-    masks: Mapping[str, str | Path] | None,
-    painted: Mapping[str | Path, Mapping[str, Any]] | None,
-) -> JobFiles:
-    styles = [style] if isinstance(style, str | Path) else style
-    return JobFiles(
-        path_or_url(scene),
-        [path_or_url(each) for each in styles],
-        None if cameras is None else path_or_url(cameras),
-        None if photos is None else Path(photos),
-        {name: Path(path) for name, path in (masks or {}).items()},
-        [Path(path) for path in painted or ()],
-    )
 
 
 def _blocking(
@@ -510,17 +513,6 @@ def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
     }
 
 
-async def _send_files(
-    transport: Transport, files: JobFiles, parameters: Mapping[str, Any], progress: Progress
-) -> list[tuple[str, Any]]:
-    """Upload the large files, and return the form fields of the request, which contain the small files and the URLs."""
-    given = json_text({name: value for name, value in parameters.items() if value is not None})
-    with tempfile.TemporaryDirectory() as folder:
-        inputs = await in_thread(input_files, replace(files, scene=await in_thread(_packed, files.scene, Path(folder))))
-        fields = await _sent(transport, inputs, progress)
-    return [*fields, ("parameters", (None, given))]
-
-
 def _packed(scene: Path | str, folder: Path) -> Path | str:
     """Return the scene, in an archive in `folder` if it is an unpacked streamed SOG."""
     index = scene_path(scene) if isinstance(scene, Path) else None
@@ -540,18 +532,14 @@ async def _sent(transport: Transport, inputs: Sequence[InputFile], progress: Pro
         if isinstance(file.source, str):
             fields.append((file.role, (None, file.source)))
         elif file.size > PART_BYTES:
-            upload_id = await _upload(transport, file.source, file.name, partial(_report_sum, progress, done, total))
+            report = partial(lambda before, now, _size: progress(before + now, total), done)
+            upload_id = await _upload(transport, file.source, file.name, report)
             fields.append((file.role, (None, upload_id)))
             done += file.size
         else:
             content = await in_thread(file.source.read_bytes)
             fields.append((file.role, (file.name, content, "application/octet-stream")))
     return fields
-
-
-def _report_sum(progress: Progress, before: int, total: int, done: int, _size: int) -> None:
-    """Report the progress of one file as part of the progress of all files."""
-    progress(before + done, total)
 
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".avif", ".heic", ".heif", ".hif")
@@ -567,42 +555,37 @@ class InputFile:
     size: int = 0
 
 
-@dataclass(frozen=True)
-class JobFiles:
-    """Files of a job: paths of local files, or URLs as text.
+def input_files(
+    scene: Path | str,
+    styles: Sequence[Path | str],
+    cameras: Path | str | None,
+    photos: Path | None,
+    masks: Mapping[str, Path],
+    painted: Sequence[Path],
+) -> list[InputFile]:
+    """Return all files that a job needs, given paths of local files, or URLs as text.
 
-    Attributes:
+    Args:
         cameras: Camera file or folder; None for an orbit.
         masks: Mask files, or folders of mask images, by the names that the job's regions give them.
         painted: Painted images of views.
-    """
-
-    scene: Path | str
-    styles: Sequence[Path | str]
-    cameras: Path | str | None = None
-    photos: Path | None = None
-    masks: Mapping[str, Path] = field(default_factory=dict)
-    painted: Sequence[Path] = ()
-
-
-def input_files(job: JobFiles) -> list[InputFile]:
-    """Return all files that a job needs.
 
     Raises:
         RequestError: If a local file is missing.
     """
-    local_styles = [style for style in job.styles if isinstance(style, Path)]
+    local_styles = [style for style in styles if isinstance(style, Path)]
     names = iter(different_names(local_styles))
-    files = [_input("scene", job.scene)]
-    files += [_input("style", style, next(names) if isinstance(style, Path) else "") for style in job.styles]
-    if job.cameras is not None:
-        cameras = [job.cameras] if isinstance(job.cameras, str) else camera_files(job.cameras)
-        files += [_input("cameras", each) for each in cameras]
-    files += [_input("photos", path, name) for path, name in (image_files(job.photos) if job.photos else [])]
-    for mask, path in job.masks.items():
+    files = [_input("scene", scene)]
+    files += [_input("style", style, next(names) if isinstance(style, Path) else "") for style in styles]
+    if cameras is not None:
+        files += [
+            _input("cameras", each) for each in ([cameras] if isinstance(cameras, str) else camera_files(cameras))
+        ]
+    files += [_input("photos", path, name) for path, name in (image_files(photos) if photos else [])]
+    for mask, path in masks.items():
         images = [(each, f"{mask}/{name}") for each, name in image_files(path)] if path.is_dir() else [(path, mask)]
         files += [_input("mask", each, name) for each, name in images]
-    return files + [_input("painted", *each) for each in zip(job.painted, different_names(job.painted), strict=True)]
+    return files + [_input("painted", *each) for each in zip(painted, different_names(painted), strict=True)]
 
 
 def _input(role: str, source: Path | str, name: str = "") -> InputFile:
@@ -630,10 +613,8 @@ def camera_files(path: Path) -> list[Path]:
     It accepts the same paths as `sgsst stylize --cameras`.
 
     Raises:
-        RequestError: If the path does not exist.
         CameraError: If there are none.
     """
-    _check_exists(path)
     cameras = find_cameras(path)
     if cameras.is_dir():
         suffix = ".bin" if (cameras / "cameras.bin").is_file() else ".txt"
@@ -643,19 +624,12 @@ def camera_files(path: Path) -> list[Path]:
     return [cameras, companion] if companion.is_file() and companion != cameras else [cameras]
 
 
-def _check_exists(path: Path) -> None:
-    """Raise a RequestError if there is neither a file nor a folder."""
-    if not path.exists():
-        raise RequestError(f"{path}: does not exist. Check the path.")
-
-
 def image_files(folder: Path) -> list[tuple[Path, str]]:
     """Return all images below a folder, with their paths relative to it.
 
     Raises:
         RequestError: If there are none.
     """
-    _check_exists(folder)
     visible = (path for path in folder.rglob("*") if not path.name.startswith("."))
     images = sorted(path for path in visible if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
     if not images:

@@ -24,10 +24,11 @@ from api.http.schemas import (
     ShareCreated,
     SharedView,
     ShareList,
+    ShareView,
     SignIn,
     address,
-    share_view,
     subpath,
+    view_of,
 )
 from api.http.sending import PAGE_HEADERS, ConditionsDep, SentFile, file_answers, send_file, shared_page, shared_policy
 from service import problems
@@ -204,7 +205,7 @@ async def create_share(
         await context.derived.poster(job, start, caller.quotas)  # a continued job has lost its own
     row, token = await asyncio.to_thread(context.store.shares.create, job_id, caller.owner, new.days * _DAY)
     place = f"/{token}" if new.poster else f"#{token}"
-    view = ShareCreated(**share_view(row).model_dump(), url=address(f"/shared{place}"), embed_url=None)
+    view = ShareCreated(**view_of(ShareView, row).model_dump(), url=address(f"/shared{place}"), embed_url=None)
     if context.settings.embed_origins:
         view.embed_url = address(f"/shared{place}?embed=1" if new.poster else f"/shared?embed=1{place}")
     return Response(view.model_dump_json(), 201, {"Cache-Control": "no-store"}, media_type="application/json")
@@ -214,7 +215,7 @@ async def create_share(
 def list_shares(job_id: JobId, context: ContextDep, caller: CallerDep) -> ShareList:
     """List the links to the result of a job that have not expired. Their tokens are not stored."""
     find(context, caller, job_id)
-    return ShareList(shares=[share_view(row) for row in context.store.shares.of_job(job_id)])
+    return ShareList(shares=[view_of(ShareView, row) for row in context.store.shares.of_job(job_id)])
 
 
 @router.delete(

@@ -236,16 +236,11 @@ Work = Callable[[Any], Coroutine[Any, Any, BaseModel]]
 
 
 async def answer_work(
-    request: Request,
-    work: Work,
-    progress: str,
-    result: str,
-    working: set[asyncio.Task[Any]],
-    checked: asyncio.Event,
+    request: Request, work: Work, progress: str, result: str, working: set[asyncio.Task[Any]]
 ) -> Response:
     """Return the result as JSON, or a stream of events if the request accepts one.
 
-    JSON is returned when the result is complete; a stream is returned as soon as the inputs are checked. If the client
+    JSON is returned when the result is complete; a stream starts at once, and reports a later error. If the client
     closes the connection, the work is canceled.
 
     Args:
@@ -254,7 +249,6 @@ async def answer_work(
         progress: Name of the progress events.
         result: Name of the event with the result.
         working: Tasks of all such work, which are canceled when the service stops.
-        checked: Event after which the stream starts, in which a later error is reported.
     """
     reports: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
     # Started here rather than in `_events`, so that the work releases its resources even if no event is read.
@@ -262,19 +256,16 @@ async def answer_work(
     task.add_done_callback(lambda _: reports.put_nowait(None))
     working.add(task)
     task.add_done_callback(working.discard)
-    streamed = _EVENTS in request.headers.get("accept", "")
-    waits: list[Coroutine[Any, Any, object]] = [_wait_for_disconnect(request), *([checked.wait()] if streamed else [])]
-    canceled: list[asyncio.Task[Any]] = [task, *map(asyncio.create_task, waits)]
+    if _EVENTS in request.headers.get("accept", ""):
+        response_headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        return StreamingResponse(_events(task, reports, progress, result), 200, response_headers, _EVENTS)
+    disconnected = asyncio.create_task(_wait_for_disconnect(request))
     try:
-        await asyncio.wait(canceled, return_when=asyncio.FIRST_COMPLETED)
-        if streamed and checked.is_set():
-            canceled.remove(task)
-            response_headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-            return StreamingResponse(_events(task, reports, progress, result), 200, response_headers, _EVENTS)
+        await asyncio.wait([task, disconnected], return_when=asyncio.FIRST_COMPLETED)
         return JSONResponse(_result(task).model_dump(mode="json")) if task.done() else Response(status_code=_CLOSED)
     finally:
-        for each in canceled:
-            each.cancel()
+        task.cancel()
+        disconnected.cancel()
 
 
 def _result(task: asyncio.Task[BaseModel]) -> BaseModel:
@@ -862,6 +853,4 @@ async def make_video(
     async def work(show: Any) -> ArtifactView:
         return artifact_view(await context.derived.video(job, options, caller.quotas, show))
 
-    checked = asyncio.Event()
-    checked.set()
-    return await answer_work(request, work, "rendering", "video", context.hub.working, checked)
+    return await answer_work(request, work, "rendering", "video", context.hub.working)

@@ -24,13 +24,13 @@ from typing import Any, Self, TypeVar
 
 import httpx2
 from fastapi import Request
-from pydantic import BaseModel
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, MultipartState, parse_options_header
 from starlette.requests import ClientDisconnect
 
 from api.http.context import memory
 from api.http.problems import raises
+from api.http.schemas import Model
 from service import problems
 from service.deadlines import FileThreads, OwnerLimit
 from service.files.blobs import Blobs, Receiver
@@ -162,7 +162,6 @@ _LEAST_RATE = 1000
 _DRAIN_BYTES, _DRAIN_SECONDS = 64 << 20, 10.0
 
 
-Model = TypeVar("Model", bound=BaseModel)
 Value = TypeVar("Value")
 
 
@@ -414,26 +413,23 @@ class _Form:
 
 
 def _keep(file: Receiver, role: str, name: str, blobs: Blobs, receipt: Receipt) -> str:
-    """Turn a complete file into a blob that the receipt holds, and return its SHA-256."""
+    """Turn a complete file into a blob that the receipt holds, and return its SHA-256.
+
+    The confined inspection process reads the file and checks the rest.
+
+    Raises:
+        INVALID_INPUT: If the file is empty.
+    """
     file.close()
-    check_size(role, name, file.size)
+    if not file.size:
+        code = f"invalid-{'image' if role in ('style', 'photos', 'painted') else role}"
+        raise problems.INVALID_INPUT(f"{name}: is empty. Send the file's content.", code=code, input=role)
     return blobs.add(file.path, receipt.id)
 
 
 def most_files(settings: ServiceSettings) -> int:
     """Return the maximum number of files of a job."""
     return settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + MOST_REGIONS + 1
-
-
-def check_size(role: str, name: str, size: int) -> None:
-    """Check that a file is not empty; the confined inspection process reads it and checks the rest.
-
-    Raises:
-        INVALID_INPUT: If the file is empty.
-    """
-    if not size:
-        code = f"invalid-{'image' if role in ('style', 'photos', 'painted') else role}"
-        raise problems.INVALID_INPUT(f"{name}: is empty. Send the file's content.", code=code, input=role)
 
 
 async def read_json(request: Request, settings: ServiceSettings, most: int) -> Any:

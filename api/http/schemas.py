@@ -19,7 +19,7 @@ from service.inputs import JobName, JobParameters
 from service.problems import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.jobs import ShownJob
-from service.store.tables import ArtifactRow, AttemptRow, Base, JobRow, ShareRow, UploadRow
+from service.store.tables import ArtifactRow, AttemptRow, Base, JobRow, UploadRow
 from sgsst_core.files.formats import ResultName
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.progress import Progress
@@ -588,20 +588,20 @@ class Health(BaseModel):
 ANSWERS: tuple[type[BaseModel], ...] = (JobPage, JobDetail, ArtifactList, UploadView, PlanView, Health)
 
 
-def _view(model: type[Model], row: Base, **given: Any) -> Model:
+def view_of(model: type[Model], row: Base, **given: Any) -> Model:
     """Return a model whose fields are columns of a database row, apart from the given ones."""
     return model(**{name: getattr(row, name) for name in model.model_fields if name not in given}, **given)
 
 
 def job_view(shown: ShownJob) -> JobView:
     """Return a job as the API shows it."""
-    return _view(JobView, shown.row, **_given_fields(shown))
+    return view_of(JobView, shown.row, **_given_fields(shown))
 
 
 def job_detail(shown: ShownJob, attempts: Sequence[AttemptRow]) -> JobDetail:
     """Return a job with its attempts."""
-    views = [_view(AttemptView, row) for row in attempts]
-    return _view(JobDetail, shown.row, **_given_fields(shown), attempts=views)
+    views = [view_of(AttemptView, row) for row in attempts]
+    return view_of(JobDetail, shown.row, **_given_fields(shown), attempts=views)
 
 
 def _given_fields(shown: ShownJob) -> dict[str, Any]:
@@ -640,14 +640,9 @@ def poll_seconds(job: JobRow) -> int | None:
 def artifact_view(row: ArtifactRow) -> ArtifactView:
     """Return a result as the API shows it."""
     url = address(f"/v1/jobs/{row.job_id}/artifacts/{row.name}")
-    return _view(ArtifactView, row, media_type=media_type(row.name), url=url)
+    return view_of(ArtifactView, row, media_type=media_type(row.name), url=url)
 
 
 def upload_view(row: UploadRow) -> UploadView:
     """Return an upload as the API shows it."""
-    return _view(UploadView, row, complete=row.sha256 is not None)
-
-
-def share_view(row: ShareRow) -> ShareView:
-    """Return a link as the API shows it."""
-    return _view(ShareView, row)
+    return view_of(UploadView, row, complete=row.sha256 is not None)

@@ -32,7 +32,6 @@ from api.http.receiving import (
     Received,
     body_blocks,
     check_media_type,
-    check_size,
     file_name,
     is_url,
     media_type,
@@ -627,8 +626,6 @@ async def create_job(
         recall = partial(context.inspector.recall, "validate", caller.owner, inputs, parameters)
         findings = await context.threads.run(caller.owner, recall)
         if findings is None:
-            for entry in inputs:
-                check_size(entry["role"], entry["name"], entry["size"])
             findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
             up, foreign = (findings["up"], findings["foreign"]) if sure_up else (None, None)
@@ -642,15 +639,12 @@ async def create_job(
             return await asyncio.to_thread(queue_job, idempotency, receipt)
         stack.pop_all()  # keep the files, which planning needs after this function returns
 
-    checked = asyncio.Event()
-    checked.set()
-
     async def plan(show: Show) -> PlanView:
         async with receipt:
             findings = await context.inspector.inspect("plan", caller.owner, inputs, rows, parameters, show)
         return PlanView(**findings, workers=parameters.workers)
 
-    return await answer_work(request, plan, "planning", "plan", context.hub.working, checked)
+    return await answer_work(request, plan, "planning", "plan", context.hub.working)
 
 
 def _find_inputs(
@@ -759,18 +753,15 @@ def _resolve_inputs(
     for _, role, text in received.uploads:
         if is_url(text):
             resolved.append((file_name(text), fetched.get(text, "")))
-            continue
-        if text in fetched:
+        elif text in fetched:
             resolved.append((RESULT, fetched[text]))
-            continue
-        if reference := _PATH.fullmatch(text.removeprefix(subpath.get())):
+        elif reference := _PATH.fullmatch(text.removeprefix(subpath.get())):
             entry = _referred_input(context, caller, reference[1], reference[2], role, released)
             resolved.append((entry["name"], entry["sha256"]))
-            continue
-        upload = uploads.get(text)
-        if upload is None:
+        elif upload := uploads.get(text):
+            resolved.append((uploaded_name(upload.metadata_header), _upload_digest(context, upload, role)))
+        else:
             raise problems.UNKNOWN_UPLOAD(upload_id=text[:60], input=role)
-        resolved.append((uploaded_name(upload.metadata_header), _upload_digest(context, upload, role)))
     digests = {sha256 for _, sha256 in resolved} | {entry["sha256"] for entry in inputs}
     rows = context.store.inputs.hold(sorted(filter(None, digests)))
     for number, ((index, role, _), (filename, sha256)) in enumerate(zip(received.uploads, resolved, strict=True)):
