@@ -156,9 +156,16 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, and return its exit code."""
+    """Run the command line, and return its exit code. A command that fails leaves no empty folders for its outputs."""
     started = process_start() if arguments is None else time.time()
-    return _run(Invocation(sys.argv[1:] if arguments is None else list(arguments), started))
+    invocation = Invocation(sys.argv[1:] if arguments is None else list(arguments), started)
+    code = FAILURE
+    try:
+        code = _run(invocation)
+    finally:
+        if code:
+            invocation.remove_empty_folders()
+    return code
 
 
 def _run(invocation: Invocation) -> int:

@@ -220,7 +220,7 @@ def test_download_to_a_full_disk_leaves_nothing(
     out = tmp_path / "new" / "out.ply"
     with full_disk(100_000):
         assert f"error: {out}: cannot be written: File too large." in sgsst(["download", job_id, "--out", str(out)], 2)
-    assert not any(path.is_file() for path in out.parent.rglob("*"))
+    assert not out.parent.exists()
 
 
 @pytest.mark.parametrize("job_id", ["", "?", ".", "..", "a/b", "a b#c"])
