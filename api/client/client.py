@@ -613,8 +613,10 @@ def camera_files(path: Path) -> list[Path]:
     It accepts the same paths as `sgsst stylize --cameras`.
 
     Raises:
+        RequestError: If the path does not exist.
         CameraError: If there are none.
     """
+    _check_exists(path)
     cameras = find_cameras(path)
     if cameras.is_dir():
         suffix = ".bin" if (cameras / "cameras.bin").is_file() else ".txt"
@@ -624,12 +626,19 @@ def camera_files(path: Path) -> list[Path]:
     return [cameras, companion] if companion.is_file() and companion != cameras else [cameras]
 
 
+def _check_exists(path: Path) -> None:
+    """Raise a RequestError if there is neither a file nor a folder."""
+    if not path.exists():
+        raise RequestError(f"{path}: does not exist. Check the path.")
+
+
 def image_files(folder: Path) -> list[tuple[Path, str]]:
     """Return all images below a folder, with their paths relative to it.
 
     Raises:
         RequestError: If there are none.
     """
+    _check_exists(folder)
     visible = (path for path in folder.rglob("*") if not path.name.startswith("."))
     images = sorted(path for path in visible if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
     if not images:

@@ -81,14 +81,18 @@ class Problem(BaseModel):
     detail: str = Field(description="What was wrong and what to do, for people.")
 
 
+def _response(status: int, code: str, detail: str, headers: dict[str, str], **extra: object) -> JSONResponse:
+    title = _TITLES.get(status) or HTTPStatus(status).phrase
+    body = Problem(title=title, status=status, code=code, detail=detail, **extra)
+    return JSONResponse(body.model_dump(mode="json"), status, headers, media_type=MEDIA_TYPE)
+
+
 def from_service(error: ServiceError) -> JSONResponse:
     """Return the problem document of a service error."""
     headers = dict(error.headers)
     if error.retry_after is not None:
         headers["Retry-After"] = str(error.retry_after)
-    title = _TITLES.get(error.status) or HTTPStatus(error.status).phrase
-    body = Problem(title=title, status=error.status, code=error.code, detail=str(error), **error.extra)
-    return JSONResponse(body.model_dump(mode="json"), error.status, headers, media_type=MEDIA_TYPE)
+    return _response(error.status, error.code, str(error), headers, **error.extra)
 
 
 async def _expected(request: Request, error: ServiceError | InvalidInputError) -> JSONResponse:
@@ -123,7 +127,7 @@ async def _http_error(request: Request, error: HTTPException) -> JSONResponse:
         allowed = [method for method in METHODS if method in routed or (method == "HEAD" and "GET" in routed)]
         method = request.method[:_SHOWN]
         return from_service(problems.METHOD_NOT_ALLOWED(path=path, method=method, allowed=", ".join(allowed)))
-    raise error  # the router raises no others
+    return _response(error.status_code, "http-error", str(error.detail), dict(error.headers or {}))
 
 
 def routed_methods(scope: Scope) -> list[str]:
