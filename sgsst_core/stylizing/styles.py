@@ -19,7 +19,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -318,21 +318,21 @@ class JobStyles:
         return [*{id(style): style for style in self.each or (self.own,)}.values()]
 
     def cached_targets(self, loss: SosLoss) -> Callable[[Camera], StyleTargets]:
-        """Return a function that returns the targets for views of a camera's size, computed at first use."""
-        targets = functools.cache(functools.partial(self.targets, loss))
+        """Return a function that returns the targets for views of a camera's size, computed at first use.
+
+        The images are copied to the network's device at once, so that no step waits for that.
+        """
+        own, *each = (style.map(lambda image: image.to(loss.network.device)) for style in (self.own, *self.each))
+        targets = functools.cache(functools.partial(replace(self, own=own, each=tuple(each)).targets, loss))
         return lambda camera: targets((camera.height, camera.width))
 
     def targets(self, loss: SosLoss, view_size: Size) -> StyleTargets:
         """Compute the targets for views of a size (height, width); see `TargetBuilder.of_style`."""
-
-        def of(style: Style) -> StyleTargets:
-            return loss.targets.of_style(style.map(lambda image: image.to(loss.network.device)), view_size)
-
         if not self.each:
-            return of(self.own)
+            return loss.targets.of_style(self.own, view_size)
         assert self.regions is not None
         weights = [self.regions.every[index].weight for index in self.regions.active]
-        return combined([of(style) for style in self.each], weights)
+        return combined([loss.targets.of_style(style, view_size) for style in self.each], weights)
 
     def transferred(self, sh_dc: Tensor, weights: Tensor, rows: Tensor, *, preserve_chroma: bool = False) -> Tensor:
         """Transfer to each Gaussian the colors of its region's style; see `warm_start`.
