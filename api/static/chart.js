@@ -10,7 +10,7 @@ const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 26, BOTTOM = 34;
 /** Return the values to label on a logarithmic axis. @param {number} low @param {number} high */
 function ticks(low, high) {
   const decades = Math.log10(high / low);
-  const digits = decades < 0.5 ? [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9] : decades < 1.2 ? [1, 2, 3, 5, 7] : decades < 4 ? [1, 2, 5] : [1];
+  const digits = decades < 0.15 ? Array.from({ length: 90 }, (_, i) => (10 + i) / 10) : decades < 0.5 ? [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9] : decades < 1.2 ? [1, 2, 3, 5, 7] : decades < 4 ? [1, 2, 5] : [1];
   const found = [], every = Math.max(1, Math.ceil(decades / 8));
   for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power++) {
     if (power % every) continue;
@@ -19,7 +19,7 @@ function ticks(low, high) {
       if (value >= low * 0.999 && value <= high * 1.001) found.push(value);
     }
   }
-  return found;
+  return found.length ? found : [low];
 }
 
 export class LossChart {
