@@ -12,7 +12,6 @@ import time
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
-from functools import cache
 from typing import Any
 
 import anyio.to_thread
@@ -112,7 +111,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         threads.close()
         store.close()
 
-    app = FastAPI(
+    app = _App(
         title="sgsst",
         version=installed_version(),
         description=_DESCRIPTION,
@@ -122,6 +121,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         redoc_url=None,
         exception_handlers=HANDLERS,
     )
+    app.settings = settings
     routers = [
         *(submission.router, jobs.router, jobs.inputs_router, jobs.artifacts_router, access.router),
         *(submission.uploads_router, access.session_router, monitoring.router),
@@ -130,20 +130,27 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         app.include_router(router)
     add_static(app)
     app.add_middleware(Deadlines, seconds=settings.answer_seconds)
-    plain_openapi, plain_stack = app.openapi, app.build_middleware_stack
 
-    @cache
+    plain = app.openapi
+
     def openapi() -> dict[str, Any]:
-        routes = [*app.routes, *(route for router in routers for route in router.routes)]
-        complete(document := plain_openapi(), routes, (Problem, JobFromUploads, *ANSWERS))
-        return document
+        if not app.openapi_schema:
+            routes = [*app.routes, *(route for router in routers for route in router.routes)]
+            complete(plain(), routes, (Problem, JobFromUploads, *ANSWERS))
+        return app.openapi_schema or {}
 
     app.openapi = openapi  # type: ignore[method-assign]
-    # These surround FastAPI's own middleware, which responds to unexpected errors.
-    app.build_middleware_stack = lambda: Observed(  # type: ignore[method-assign]
-        Adapted(plain_stack(), settings), app.state
-    )
     return app
+
+
+class _App(FastAPI):
+    """FastAPI with middleware around its own, which responds to unexpected errors."""
+
+    settings: ServiceSettings
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """Return the app with all middleware."""
+        return Observed(Adapted(super().build_middleware_stack(), self.settings), self.state)
 
 
 #: Path of the uploads, whose protocol lets a header replace the method, for clients that can only send GET and POST.

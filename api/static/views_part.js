@@ -92,7 +92,7 @@ export class ViewsPart {
     this.showCameras();
   }
 
-  /** Show the cameras. A change is told before files are read, so that it clears no answer that comes meanwhile. @param {boolean} [changed] whether the views have changed */
+  /** Show the cameras. Report a change before files are read, because a later report would clear answers that have come meanwhile. @param {boolean} [changed] whether the views have changed */
   async showCameras(changed = true) {
     const { cameras: slot } = this.slots, { viewer } = this.stage, turn = ++this.turn;
     if (changed) this.changed();
