@@ -31,13 +31,13 @@ from tests.service.files.s3 import FaultyS3, environment_of
 
 @pytest.fixture
 def s3(s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyS3]:
-    def is_made() -> bool:
+    def has_bucket() -> bool:
         try:
             return httpx2.put(f"{s3_url}/files").status_code == 200
         except httpx2.TransportError:  # a server that has just started may drop a connection
             return False
 
-    wait_for(is_made, "the bucket")
+    wait_for(has_bucket, "the bucket")
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "node"))
     monkeypatch.setenv("SGSST_CACHE", os.environ.get("SGSST_CACHE", ""))
     monkeypatch.setattr(attempt_files, "_SCAN_SECONDS", 0.05)
