@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,9 +15,8 @@ from torch import Tensor
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
 from sgsst_core.progress import Decision
-from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene.camera import Camera, look_at, resized
-from sgsst_core.scene.gaussians import Scene, rotations, sampled, sampled_rows
+from sgsst_core.scene.camera import Camera, look_at
+from sgsst_core.scene.gaussians import Scene, rotations, sampled_rows
 
 #: Number of Gaussians sampled to compute the extent, which is then accurate to well under 1 %, and maximum number of
 #: points stored in a `Subject`.
@@ -684,23 +683,14 @@ def _widened(half: tuple[float, float], shape: float) -> tuple[float, float]:
     return (max(x, y * shape), max(y, x / shape))
 
 
-#: Elevations in degrees of rings that may be added to the first. Rings below the horizon are only for an isolated
-#: subject, without ground or background.
-_ABOVE, _BELOW = (40.0, 70.0), (-20.0,)
-#: Minimum fraction of the surface that a ring must add.
-_LITTLE = 0.03
-#: Default number of views of a ring at elevation 0. All rings together then have 49 views.
+#: Elevations in degrees by the number of rings. On two statues, a brooch and a rider, and on two subjects above a
+#: ground or before a background, each next ring added most of the surface, and a further one less than 3 %.
+_ISOLATED = ((ELEVATION,), (ELEVATION, -20.0), (ELEVATION, 40.0, -20.0))
+_WITH_GROUND = ((ELEVATION,), (ELEVATION, 70.0))
+#: Default number of views of a ring at elevation 0. The default orbit then has 43 views, or 22 above a ground.
 _AROUND = 16
 #: Minimum number of views per ring if there are several rings.
 _MIN_VIEWS = 6
-#: Fraction of its largest visible area from which on a surface counts as fully seen: that of a surface rotated by 45
-#: degrees.
-_ENOUGH = 0.7
-#: A surface counts as inside the scene if views show less than the first fraction of its area. The second is the
-#: maximum fraction of such surfaces without a warning.
-_HARDLY, _INSIDE = 0.02, 0.3
-#: Trial views: number in a ring at elevation 0, resolution, and number of sampled Gaussians.
-_TRIALS, _TRIAL_SIDE, _TRIAL_GAUSSIANS = 8, 160, 50_000
 
 
 @dataclass(frozen=True)
@@ -709,7 +699,7 @@ class OrbitRequest:
 
     Attributes:
         up: [3], world direction of up.
-        elevation: Elevation in degrees of the orbit's only ring; None to choose one or several rings.
+        elevation: Elevation in degrees of the orbit's only ring; None for as many rings as `count` suffices for.
         radius: Distance of the cameras from the center in world units.
     """
 
@@ -729,20 +719,14 @@ class Orbit:
         up: Up direction with its reason.
         elevations: Elevations of the rings in degrees.
         radius: Distance of the cameras from the center of the subject in world units.
-        tried: Elevations that were tried.
-        shown: Surface that the rings show, as a fraction of what all tried rings would show.
         outside: Fraction of the scene that is not part of the subject.
-        inside: Fraction of the surface that no trial view shows.
     """
 
     cameras: list[Camera]
     up: Up
     elevations: tuple[float, ...]
     radius: float
-    tried: tuple[float, ...]
-    shown: float
     outside: float
-    inside: float
 
 
 def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = None) -> Orbit:
@@ -756,23 +740,19 @@ def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = N
         SettingsError: If an option is out of range; see `orbit`.
     """
     subject, up = find_upright_subject(scene, request.up, remaining)
-    first = ELEVATION if request.elevation is None else request.elevation
-    rings = request.count // _MIN_VIEWS if request.count is not None else 1 + len(_ABOVE + _BELOW)
-    tried = [first]
-    if request.elevation is None and rings > 1:
-        alone = not up.ground and subject.left_out <= _WHOLE
-        tried += [*_ABOVE, *(_BELOW if alone else ())]
-    trial = _Trial(scene, subject, up, request, remaining)
-    areas = [trial.of_ring(elevation) for elevation in tried]
-    chosen, shown = _needed(areas, max(rings, 1))
-    elevations = tuple(tried[ring] for ring in chosen)
+    rings: Sequence[Sequence[float]] = _ISOLATED if not up.ground and subject.left_out <= _WHOLE else _WITH_GROUND
+    if request.elevation is not None:
+        rings = ((request.elevation,),)
     count = request.count
     if count is None:
+        elevations = rings[-1]
         count = sum(max(_MIN_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
-    cameras = trial.cameras(count, elevations)
+    else:
+        elevations = rings[max(1, min(count // _MIN_VIEWS, len(rings))) - 1]
+    axis, radius = up.direction.tolist(), request.radius
+    cameras = orbit(subject, count, up=axis, elevations=elevations, radius=radius, near=request.near)
     radius = float((cameras[0].center - middle_of(subject, up.direction)).norm())
-    inside = trial.hidden_fraction(areas)
-    return Orbit(cameras, up, elevations, radius, tuple(tried), shown, subject.left_out, inside)
+    return Orbit(cameras, up, tuple(elevations), radius, subject.left_out)
 
 
 def find_upright_subject(
@@ -800,95 +780,13 @@ def orbit_decisions(orbit: Orbit, count: int) -> list[Decision]:
     *others, last = [f"{angle:g}" for angle in orbit.elevations]
     angles = f"{', '.join(others)} and {last}" if others else last
     rings = f"{len(orbit.elevations)} rings" if len(orbit.elevations) > 1 else "a ring"
-    reason = "requested"
-    if len(orbit.tried) > 1:
-        tried = f"rings at {min(orbit.tried):g} to {max(orbit.tried):g} degrees"
-        reason = f"they show {orbit.shown:.0%} of the surface that {tried} show"
+    reason = "views from several heights show more of the surface" if others else "requested"
     views = f"{count} view{'s' if count > 1 else ''}"
     decisions.append(
         Decision("cameras", f"{views} in {rings} at {angles} degrees, {orbit.radius:.3g} from the center", reason)
     )
-    outside = f"{orbit.outside:.0%} of the scene lies outside the frames"
-    inside = f"{orbit.inside:.0%} of the scene lies inside, hidden from all views around it"
-    doubts = (
-        (orbit.outside > _WHOLE, outside, "it is not a single object"),
-        (orbit.inside > _INSIDE, inside, "it may be a room"),
-    )
-    for doubted, text, reason in doubts:
-        if doubted:
-            better = f"{reason}; the cameras of its capture (--cameras) would show it better"
-            decisions.append(Decision("subject", f"warning: {text}", better))
+    if orbit.outside > _WHOLE:
+        text = f"warning: {orbit.outside:.0%} of the scene lies outside the frames"
+        better = "it is not a single object; the cameras of its capture (--cameras) would show it better"
+        decisions.append(Decision("subject", text, better))
     return decisions
-
-
-class _Trial:
-    """Renderer of small trial views of a scene, or of an enlarged sample of its Gaussians, for comparing rings."""
-
-    def __init__(self, scene: Scene, subject: Subject, up: Up, request: OrbitRequest, remaining: Tensor | None) -> None:
-        self._subject, self._up, self._request = subject, up, request
-        colorless = replace(scene, sh_rest=scene.means.new_zeros((len(scene), 0, 3)))
-        self._scene = sampled(colorless, _TRIAL_GAUSSIANS)
-        self._rasterizer = make_rasterizer("cpu", self._scene, near=request.near)
-        self._cropped = None if remaining is None else ~remaining[sampled_rows(len(scene), _TRIAL_GAUSSIANS)]
-
-    def cameras(self, count: int, elevations: Sequence[float]) -> list[Camera]:
-        """Return the cameras of the orbit with these rings."""
-        axis, request = self._up.direction.tolist(), self._request
-        return orbit(self._subject, count, up=axis, elevations=elevations, radius=request.radius, near=request.near)
-
-    def hidden_fraction(self, areas: Sequence[Tensor]) -> float:
-        """Return the fraction of the surface that is hidden from all rings, given the areas [n] that each shows."""
-        lengths = self._scene.scales.double().clamp(-60, 60).exp().sort(dim=1).values
-        surface = 2 * math.pi * torch.sigmoid(self._scene.opacities.double()) * lengths[:, 1] * lengths[:, 2]
-        if self._cropped is not None:
-            surface[self._cropped] = 0
-        shown = torch.stack(list(areas)).amax(0)
-        return float(surface[shown < _HARDLY * surface].sum() / surface.sum().clamp_min(1e-300))
-
-    def of_ring(self, elevation: float) -> Tensor:
-        """Return the visible area of each Gaussian in the trial view of a ring that shows most of it, [n].
-
-        Areas are in squared world units.
-        """
-        count = max(4, round(_TRIALS * math.cos(math.radians(elevation))))
-        areas = torch.zeros(len(self._scene), dtype=torch.float64)
-        for camera in self.cameras(count, [elevation]):
-            small = resized(camera, _TRIAL_SIDE)
-            weights = self._rasterizer.survey(small)[1].double()
-            depths = self._scene.means.double() @ small.world_to_camera[2, :3] + small.world_to_camera[2, 3]
-            # area of a pixel at this depth, perpendicular to the view
-            areas = torch.maximum(areas, weights * (depths / small.fx) ** 2)
-        if self._cropped is not None:
-            areas[self._cropped] = 0
-        return areas
-
-
-def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float]:
-    """Choose rings greedily: the first one, then repeatedly the one that adds most surface, until the gain is small.
-
-    For each Gaussian, the view that shows most of it counts. The surface that a set of rings shows is the sum of these
-    areas, relative to that of all rings. A Gaussian counts fully if a ring shows at least the fraction `_ENOUGH` of its
-    largest area, and in proportion below that.
-
-    Args:
-        areas: Areas [n] for each ring.
-        most: Maximum number of rings to choose.
-
-    Returns:
-        Indices of the chosen rings, ascending, and fraction of the surface that they show.
-    """
-    best_of_all = torch.stack(list(areas)).amax(0)
-    areas = [(area / _ENOUGH).minimum(best_of_all) for area in areas]
-    total = float(best_of_all.sum()) or 1.0
-    chosen, covered = [0], areas[0]
-    while True:
-        gains = {
-            ring: float((torch.maximum(covered, areas[ring]) - covered).sum()) / total
-            for ring in range(len(areas))
-            if ring not in chosen
-        }
-        best = max(gains, key=lambda ring: gains[ring], default=None)
-        if best is None or gains[best] < _LITTLE or len(chosen) >= most:
-            return sorted(chosen), float(covered.sum()) / total
-        chosen.append(best)
-        covered = torch.maximum(covered, areas[best])

@@ -59,8 +59,8 @@ class ViewOptions(BaseModel):
 
     orbit: Annotated[Views | None, Option(unit="views", metavar="N", default="cameras from files, else auto")] = Field(
         None,
-        description="Create N views around the scene instead of reading camera files; auto: as many as its surface "
-        "needs. They form rings at as many elevations as needed.",
+        description="Create N views around the scene instead of reading camera files; auto: 43, or 22 above a ground. "
+        "They form rings at up to three elevations.",
     )
     up: Up = Field("auto", description="Up axis of the scene, for an orbit; auto: estimated from the scene.")
     elevation: Annotated[float | None, Option(unit="degrees", metavar="E", default="automatic")] = Field(

@@ -430,25 +430,18 @@ def table() -> Scene:
 def test_scene_with_ground_gets_views_from_above_and_none_from_below() -> None:
     orbit = make_orbit(table(), OrbitRequest(count=24))
     assert orbit.up.ground
-    assert orbit.elevations[0] == 10
-    assert max(orbit.elevations) >= 40
-    assert min(orbit.tried) > 0
-    assert orbit.shown > 0.9
+    assert orbit.elevations == (10, 70)
     assert len(orbit.cameras) == 24
 
 
-def test_pole_gets_no_views_from_above() -> None:
-    pole = scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01)
-    orbit = make_orbit(pole, OrbitRequest(count=24))
-    assert (max(orbit.elevations), max(orbit.tried)) == (10, 70)
-
-
-def test_automatic_view_count_is_bounded_and_grows_with_the_rings() -> None:
-    pole = make_orbit(scene_of(box((-0.05, -2, -0.05), (0.05, 2, 0.05), 3000), 0.01), OrbitRequest())
-    wide = make_orbit(table(), OrbitRequest())
-    for each in (pole, wide):
-        assert 16 * len(each.elevations) / 3 < len(each.cameras) <= 16 * len(each.elevations)
-    assert len({camera.name for camera in wide.cameras}) == len(wide.cameras)
+@pytest.mark.parametrize(
+    ("scene", "count", "rings"),
+    [(figure(), None, 3), (figure(), 17, 2), (figure(), 18, 3), (table(), None, 2), (table(), 24, 2)],
+)
+def test_automatic_views_are_distributed_over_rings(scene: Scene, count: int | None, rings: int) -> None:
+    orbit = make_orbit(scene, OrbitRequest(count=count))
+    assert len(orbit.elevations) == rings
+    assert len({camera.name for camera in orbit.cameras}) == (count or {3: 43, 2: 22}[rings])
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 11])
@@ -501,24 +494,18 @@ def test_plan_lines_state_the_reasons_of_an_orbit() -> None:
     decisions = plan_lines(orbit)
     assert decisions["up"].decision == "-y"
     assert "times as tall as wide" in decisions["up"].reason
-    assert decisions["cameras"].decision.startswith(f"24 views in {len(orbit.elevations)} rings at 10")
-    assert f"{orbit.shown:.0%} of the surface" in decisions["cameras"].reason
+    assert decisions["cameras"].decision.startswith("24 views in 3 rings at 10, 40 and -20 degrees, ")
+    assert "more of the surface" in decisions["cameras"].reason
     assert "subject" not in decisions
 
 
-@pytest.mark.parametrize(
-    ("surroundings", "what"),
-    [
-        (scene_of(box((-4, -4, -4), (4, 4, 4), 1000), 0.05), "outside the frames"),
-        (scene_of(box((-1, -1, -1), (1, 1, 1), 3000), 0.05), "lies inside"),
-    ],
-)
-def test_plan_warns_that_a_room_is_not_a_single_object(surroundings: Scene, what: str) -> None:
+def test_plan_warns_that_a_room_is_not_a_single_object() -> None:
+    surroundings = scene_of(box((-4, -4, -4), (4, 4, 4), 1000), 0.05)
     scene = joined(scene_of(ball((0, 0, 0), 0.5, 5000), 0.05), surroundings)
     orbit = make_orbit(scene, OrbitRequest(count=12))
     warning = plan_lines(orbit)["subject"]
     assert warning.decision.startswith("warning: ")
-    assert what in warning.decision
+    assert "outside the frames" in warning.decision
     assert "--cameras" in warning.reason
     assert len(orbit.cameras) == 12
 
@@ -528,7 +515,6 @@ def test_degenerate_scenes_have_an_automatic_orbit(name: str) -> None:
     for request in (OrbitRequest(), OrbitRequest(count=3)):
         orbit = make_orbit(ODD[name], request)
         assert all(bool(torch.isfinite(camera.world_to_camera).all()) for camera in orbit.cameras)
-        assert 0 <= orbit.shown <= 1 + 1e-9
 
 
 def test_automatic_orbits_are_deterministic() -> None:
