@@ -20,8 +20,9 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.quality.measure import Float32Reference
-from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.triton import CachedRasterizer
 from sgsst_core.regions import (
     ContentMaps,
     Region,
@@ -382,13 +383,18 @@ def make(weights: BackboneWeights, scene: Scene, regions: Regions | None, image:
 
 
 @pytest.mark.parametrize(
-    ("name", "background"), [("cpu", (0.0, 0.0, 0.0)), ("cached", (0.3, 1.0, 0.1)), ("reference", (0.3, 1.0, 0.1))]
+    ("kind", "background"),
+    [
+        (CpuRasterizer, (0.0, 0.0, 0.0)),
+        (CachedRasterizer, (0.3, 1.0, 0.1)),
+        (ReferenceRasterizer, (0.3, 1.0, 0.1)),
+    ],
 )
-def test_maps_sum_to_the_coverage(name: Any, background: tuple[float, float, float]) -> None:
+def test_maps_sum_to_the_coverage(kind: type[Rasterizer], background: tuple[float, float, float]) -> None:
     scene, (view, *_) = ball(), cameras()
     labels = torch.arange(len(scene), dtype=torch.uint8) % 5
     labels[labels == 4] = 200
-    rasterizer = make_rasterizer(name, scene, background=background)
+    rasterizer = kind(scene, background=background)
     maps = RegionMaps(labels, (0, 1, 2, 3, 200), rasterizer).render(view)
     assert maps.shape == (view.height, view.width, 5)
     torch.testing.assert_close(maps.sum(dim=2), rasterizer.coverage(view), atol=1e-5, rtol=0)

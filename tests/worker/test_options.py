@@ -152,6 +152,8 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
         ((["a:sphere=0,0,0,1"], [], ["a=x"], []), "weight = 'x': Input should be a valid number"),
         ((["a:sphere=0,0,0,1"], ["a=x.jpg:0"], [], []), "the weight must be a finite number above 0, not 0"),
         ((["a:sphere=0,0,0,1"], ["a=x.jpg"], [], ["a"]), "is frozen, so it cannot have a style or weight"),
+        ((["a:sphere=0,0,0,1"], [], [], ["a=false"]), "--region-freeze a=false: expected NAME. Give only"),
+        (([], [], [], ["rest="]), "--region-freeze rest=: expected NAME. Give only"),
         ((["a:sphere=0,0,0,1"], [], [], ["a"], ["a=light"]), "is frozen, so it cannot have a style or weight"),
         ((["a:sphere=0,0,0,1"], [], [], [], ["a"]), "--region-content-weight a: expected NAME=VALUE"),
         ((["a:sphere=0,0,0,1"], [], [], [], ["a=-1"]), "Input should be greater than or equal to 0"),

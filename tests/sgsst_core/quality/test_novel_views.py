@@ -28,6 +28,7 @@ from sgsst_core.quality.novel_views import (
     view_pairs,
 )
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.scales import scale_count
 from sgsst_core.scene.camera import Camera, between, look_at
 from sgsst_core.scene.colors import resize_area, style_size
@@ -382,11 +383,11 @@ def pixel_centers(camera: Camera) -> Tensor:
     ],
     ids=["parallel", "slanted"],
 )
-@pytest.mark.parametrize("name", ["cpu", "reference"])
-def test_pixels_of_a_plane_move_by_its_homography(first: Camera, tolerance: float, name: str):
+@pytest.mark.parametrize("kind", [CpuRasterizer, ReferenceRasterizer])
+def test_pixels_of_a_plane_move_by_its_homography(first: Camera, tolerance: float, kind: type[Rasterizer]):
     scene = plane(5, 4, DEPTH)
     other = replace(camera((-0.6, 0.4, 0.5)), width=80, height=40, fx=90.0, cx=37.0, cy=22.0)
-    depth = expected_depth(scene, first, make_rasterizer(name, scene))
+    depth = expected_depth(scene, first, kind(scene))
     assert depth.known.all()
     x, y, z = project_pixels(depth.depth, 0, first, other)
     expected = pixel_centers(first) @ homography(first, other).T

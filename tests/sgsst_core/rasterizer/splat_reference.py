@@ -1,6 +1,6 @@
 """`reference`: plain PyTorch in float64, written from the formulas and independent of the compiled code.
 
-The fast rasterizers are tested against it. Importing this module adds it to `RASTERIZERS`.
+The fast rasterizers are tested against it. It is not in `RASTERIZERS`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, NEAR, TRANSMITTANCE_MIN
-from sgsst_core.rasterizer import RASTERIZERS, Rasterizer
+from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene, unit_rotations
 
@@ -178,6 +178,3 @@ def _blended(alpha: Tensor) -> tuple[Tensor, Tensor]:
     weights = torch.where(unfinished[..., 1:] & (alpha >= ALPHA_MIN), alpha * transmittance[..., :-1], 0)
     # Transmittance only decreases, so its last value is its minimum.
     return weights, torch.where(unfinished, transmittance, 1).amin(-1)
-
-
-RASTERIZERS[ReferenceRasterizer.name] = ReferenceRasterizer

@@ -19,10 +19,8 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
-from sgsst_core.rasterizer.cpu import (
-    CpuRasterizer,
-    project,
-)
+from sgsst_core.rasterizer.cpu import CpuRasterizer, project
+from sgsst_core.rasterizer.triton import CachedRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering
@@ -44,7 +42,9 @@ from tests.sgsst_core.splat_scenes import (
 #: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
 #: Rasterizers of the CPU; `test_triton.py` compares `cached`, which runs in Triton's interpreter here.
-ALL = [name for name, kind in RASTERIZERS.items() if not kind.on_gpu and name != "cached"]
+ALL = [*(each for each in RASTERIZERS.values() if not each.on_gpu), ReferenceRasterizer]
+ALL.remove(CachedRasterizer)
+kinds = pytest.mark.parametrize("kind", ALL, ids=lambda kind: kind.name)
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
     "cloud": lambda: (cloud(), camera()),
@@ -133,10 +133,10 @@ def test_reference_agrees_with_a_loop_over_pixels() -> None:
     assert torch.allclose(rendered, image, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_gradient_is_transpose_and_agrees_with_differences(name: str) -> None:
+@kinds
+def test_gradient_is_transpose_and_agrees_with_differences(kind: type[Rasterizer]) -> None:
     scene, view = cloud(seed=11), camera()
-    rasterizer = make_rasterizer(name, scene, background=(0.3, 0.6, 0.9))
+    rasterizer = kind(scene, background=(0.3, 0.6, 0.9))
     colors, pixels = colors_of(scene).double(), pixels_like(view).double()
     black = rasterizer.render(torch.zeros_like(colors), view).double()
     gradient = rasterizer.color_gradient(pixels, view).double()
@@ -151,13 +151,13 @@ def test_gradient_is_transpose_and_agrees_with_differences(name: str) -> None:
         assert float((difference * pixels).sum()) == pytest.approx(float(gradient[gaussian, 1]), rel=2e-4, abs=2e-4)
 
 
-@pytest.mark.parametrize("name", ALL)
+@kinds
 @pytest.mark.parametrize(("row", "column"), [(7, 32), (16, 16), (32, 1)])
-def test_crops_of_a_view_make_up_the_whole_view(name: str, row: int, column: int) -> None:
+def test_crops_of_a_view_make_up_the_whole_view(kind: type[Rasterizer], row: int, column: int) -> None:
     """Gaussians near the border are large on screen, so that the slopes of their projections are clamped."""
     scene, view = cloud(seed=12, log_scale=-1.0), camera(focal=20.0)
     colors, pixels = colors_of(scene), pixels_like(view)
-    rasterizer = make_rasterizer(name, scene, background=(1, 1, 1))
+    rasterizer = kind(scene, background=(1, 1, 1))
     image, coverage = torch.zeros(view.height, view.width, 3), torch.zeros(view.height, view.width)
     gradient = torch.zeros(len(scene), 3, dtype=rasterizer.dtype)
     for top, bottom in ((0, row), (row, view.height)):
@@ -187,25 +187,25 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
-@pytest.mark.parametrize("name", ALL)
+@kinds
 @pytest.mark.parametrize(
     "scene",
     [cloud(0), single((0, 0, -3.0)), single((1e6, 0, 1.0)), single((0, 0, 3.0), opacity=0.003)],
     ids=["empty", "behind", "beside", "faint"],
 )
-def test_view_without_gaussians_is_background(name: str, scene: Scene) -> None:
+def test_view_without_gaussians_is_background(kind: type[Rasterizer], scene: Scene) -> None:
     background = (0.5, 0.25, 0.125)
-    assert_background(make_rasterizer(name, scene, background=background), scene, camera(), background)
+    assert_background(kind(scene, background=background), scene, camera(), background)
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_gaussian_that_would_saturate_a_pixel_is_not_blended(name: str) -> None:
+@kinds
+def test_gaussian_that_would_saturate_a_pixel_is_not_blended(kind: type[Rasterizer]) -> None:
     """Two opaque Gaussians would leave (1 - 0.99)^2 = TRANSMITTANCE_MIN, so the second one is already skipped."""
     scene = together([((0, 0, z), 0.9999, (50.0,) * 3, (1, 0, 0, 0)) for z in (3.0, 4.0, 5.0)])
-    image = make_rasterizer(name, scene).render(torch.eye(3), camera(20, 20))
+    image = kind(scene).render(torch.eye(3), camera(20, 20))
     assert float((image[..., 0] - 0.99).abs().max()) < 1e-6
     assert not image[..., 1:].any()
-    assert float((make_rasterizer(name, scene).coverage(camera(20, 20)) - 0.99).abs().max()) < 1e-6
+    assert float((kind(scene).coverage(camera(20, 20)) - 0.99).abs().max()) < 1e-6
 
 
 def test_distant_center_keeps_its_precision() -> None:
@@ -284,7 +284,6 @@ def test_kernels_do_not_change_the_number_of_torch_threads() -> None:
     assert finished.returncode == 0, finished.stderr
 
 
-CPU = [name for name, kind in RASTERIZERS.items() if not kind.on_gpu]
 RENDERINGS = [CLASSIC, Rendering("antialiased"), Rendering("antialiased", 0.1), Rendering("classic", 0.1)]
 texts = pytest.mark.parametrize("rendering", RENDERINGS, ids=lambda rendering: rendering.text)
 
@@ -298,9 +297,9 @@ def test_rasterizers_agree_with_an_independent_renderer(rendering: Rendering, lo
         scene, view, colors.double().numpy(), antialiased=rendering.antialiased, eps2d=rendering.eps2d
     )
     assert expected.max() > 0.05
-    for name in CPU:
-        image = make_rasterizer(name, replace(scene, rendering=rendering)).render(colors, view)
-        assert independent.psnr(image.double().numpy(), expected) > 60, name
+    for kind in (*ALL, CachedRasterizer):
+        image = kind(replace(scene, rendering=rendering)).render(colors, view)
+        assert independent.psnr(image.double().numpy(), expected) > 60, kind.name
 
 
 def test_extreme_shapes_are_drawn_or_dropped() -> None:

@@ -15,7 +15,7 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel import ALONE, Collectives, Divider, Tiling
 from sgsst_core.planning.survey import survey_views
-from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.rasterizer import RASTERIZERS, make_rasterizer
 from sgsst_core.regions import Region, Regions
 from sgsst_core.scales import EVEN, ScaleWeights
 from sgsst_core.scene.camera import Camera
@@ -218,11 +218,10 @@ def stylize_each(collectives: Collectives) -> list[dict[str, Any]]:
         job = plan_job(JobInputs(*inputs, weights=weights), collectives=collectives)
         stylizer = Stylizer(job)
         run(stylizer)
-        exact = prepare_job(
-            replace(job.plan, uncached=ReferenceRasterizer.name, cached_weights="none"),
-            JobInputs(*inputs, weights=weights),
-            collectives=collectives,
-        )
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(RASTERIZERS, ReferenceRasterizer.name, ReferenceRasterizer)
+            plan = replace(job.plan, uncached=ReferenceRasterizer.name, cached_weights="none")
+            exact = prepare_job(plan, JobInputs(*inputs, weights=weights), collectives=collectives)
         exact.loss.network = FeatureNetwork(weights, job.network.layers, torch.float64)
         other = Stylizer(replace(exact, network=exact.loss.network))
         other.sh_dc = torch.nn.Parameter(torch.roll(other.sh_dc.detach(), 1, dims=0).double())
