@@ -531,12 +531,14 @@ def region_options(
     fields = {"style": styles, "weight": weights, "content_weight": content_weights, "freeze": frozen}
     for field_name, text in ((field_name, text) for field_name, texts in fields.items() for text in texts):
         option = f"--region-{field_name.replace('_', '-')} {text}"
-        name, _, value = text.partition("=")
+        name, separator, value = text.partition("=")
         if name not in known:
             raise SettingsError(
                 f"{option}: there is no region {name!r}. Use one of {', '.join(known)}, or add it with --region."
             )
-        if not value and field_name != "freeze":
+        if field_name == "freeze" and separator:
+            raise SettingsError(f"{option}: expected NAME. Give only the region's name, or omit the option.")
+        if field_name != "freeze" and not value:
             raise SettingsError(f"{option}: expected NAME=VALUE. Give the value after the region's name.")
         values = by_name.setdefault(name, {"name": name})
         if field_name == "style":
