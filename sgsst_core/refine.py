@@ -49,7 +49,7 @@ MAX_PIECES = 32
 _SLOPE, _START = 0.35, 0.33
 #: The weights of K pieces end at _END - _FEWER / K deviations of the Gaussian function; fitted to the best ends.
 _END, _FEWER = 2.85, 4.2
-#: Number of Gaussians that are split at a time; their children take some tens of megabytes in float64.
+#: Number of Gaussians that are split at a time. Their children, at most a million, take about 250 MB in float64.
 _PARENTS = 1 << 10
 #: Limits of log scale and position. Gaussians beyond them are not split, because their children could leave the range
 #: of float32.
