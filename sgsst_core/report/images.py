@@ -112,7 +112,7 @@ def write_grid(path: Path, rows: Sequence[Sequence[tuple[str, Tensor] | None]]) 
 
 
 def _save_grid(path: Path, grid: Sequence[Sequence[tuple[str, Image.Image] | None]]) -> None:
-    """Write a JPEG with rows of images; see `write_grid`. Labels that are wider than their image lose their end."""
+    """Write a JPEG with rows of images; see `write_grid`."""
     widths = [max((cell[1].width for cell in column if cell), default=0) for column in zip_longest(*grid)]
     heights = [max((cell[1].height for cell in row if cell), default=0) for row in grid]
     size = sum(widths) + _GAP * (len(widths) + 1), sum(heights) + _LINE * len(heights) + _GAP
@@ -124,14 +124,22 @@ def _save_grid(path: Path, grid: Sequence[Sequence[tuple[str, Image.Image] | Non
             label, image = cell or ("", None)
             if image is not None:
                 sheet.paste(image, (left, top))
-                label = label.replace("\n", " ")[: image.width]  # names in camera files may have a million characters
-                while draw.textlength(label, font) > image.width:  # narrow portrait views
-                    label = label[:-1]
-                draw.text((left, top - _LABEL), label, INK, font)
+                draw.text((left, top - _LABEL), _shortened(label, image.width, font), INK, font)
             left += width + _GAP
         top += height + _LINE
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
+
+
+def _shortened(label: str, width: int, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> str:
+    """Return a label on one line, without its middle if it is wider: names of cameras differ at their end."""
+    line = label.replace("\n", " ")
+    for length in range(min(len(line), width), 0, -1):  # names in camera files may have a million characters
+        start = length // 3
+        text = line if length == len(line) else f"{line[:start]}...{line[start - length :]}"
+        if font.getlength(text) <= width:
+            return text
+    return ""
 
 
 def _fitted(image: Tensor) -> Image.Image:
