@@ -17,6 +17,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -185,7 +186,9 @@ def _silence_ray() -> None:
 
 
 #: Seconds to wait for resources in use. Those of lost ranks are soon free again.
-PLACE_SECONDS = 5.0
+PLACE_SECONDS = 5
+#: Seconds after which the number of ranks to reserve resources for is halved instead of reduced by one.
+_SHORTEN_SECONDS = 10
 
 
 def first_line(error: BaseException) -> str:
@@ -259,16 +262,18 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
     # A job that needs more memory than any machine has gets all of the largest machine's, and may still succeed there.
     most = max((int(node.get("memory", 0)) for node in nodes if node.get("GPU")), default=0)
     of_gpu = {"GPU": 1, "memory": min(memory_beside_gpus(1, scene), most)} if gpus else {}
+    patience, deadline = PLACE_SECONDS, time.monotonic() + _SHORTEN_SECONDS
     while wanted > 0:
         group = placement_group([{"CPU": threads, **of_gpu}] * wanted, strategy="PACK" if gpus else "SPREAD")
         reservation = Reservation(group, wanted, threads, 1 if gpus else 0)
-        if group.wait(PLACE_SECONDS):
+        if group.wait(patience):
             return reservation
         reservation.release()
         if threads > 1 and not gpus:  # other jobs may use some of the cores
             threads = 1
         else:
-            wanted -= 1
+            wanted = wanted - 1 if time.monotonic() < deadline else wanted // 2
+        patience = max(int(deadline - time.monotonic()) // max(wanted, 1), 1)  # Ray ignores fractions of a second
     needed = ", ".join(f"{name} {amount:,}" for name, amount in {"CPU": threads, **of_gpu}.items())
     raise NoCapacityError(f"Ray has no capacity for a worker, which needs {needed}")
 
