@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from service.inputs import PLAN
 from service.scheduling.messages import OUTAGE, Ending, Report, Task, cause_of_error, failure
 from service.states import AttemptOutcome, Cause
+from sgsst_core.errors import RanksFailedError, SgsstError
 from sgsst_core.progress import Progress
 from worker.processes import die_with_parent, process_start
 
@@ -42,11 +43,7 @@ def run(task: Task) -> None:
     try:
         result = _stylize(task, stopping, finishing)
     except Exception as error:
-        send(Report(ending=failure(error)))
-        if cause_of_error(error) != Cause.JOB:
-            log(OUTAGE["message"])  # the details are for the operator only
-        else:
-            traceback.print_exc()
+        report_failure(error)
         return
     if result is not None and result.stopped != "interrupted":
         send(Report(ending=Ending(AttemptOutcome.SUCCEEDED, result=result)))
@@ -75,6 +72,17 @@ def _stylize(task: Task, stopping: threading.Event, finishing: threading.Event) 
     )
     workers = task.workers if task.workers > 1 or task.cluster else None
     return stylize(task.spec, workers, listener, options).result
+
+
+def report_failure(error: Exception) -> None:
+    """Report the error that ended the attempt. The log gets its traceback only if it is unexpected."""
+    send(Report(ending=failure(error)))
+    if cause_of_error(error) != Cause.JOB:
+        log(OUTAGE["message"])  # the details are for the operator only
+    elif isinstance(error, SgsstError) and not isinstance(error, RanksFailedError):
+        log(f"error: {error}")
+    else:  # unexpected, as is what made ranks fail
+        traceback.print_exception(error)
 
 
 def report_progress(now: Progress) -> None:

@@ -18,7 +18,7 @@ from service.files.objects import Artifacts
 from service.problems import NoSpaceError
 from service.scheduling import attempt_process
 from service.scheduling.attempt_files import Outbox, Publisher, sweep
-from service.scheduling.attempt_process import report_prepared, report_progress
+from service.scheduling.attempt_process import report_failure, report_prepared, report_progress
 from service.scheduling.attempts import progress_seconds
 from service.scheduling.messages import Ending, Report, StopRequest, attempt_ending, cause_of_error, failure, outage
 from service.settings import ServiceSettings
@@ -27,6 +27,7 @@ from service.store import Store
 from service.store.queue import Lease, cause_of
 from sgsst_core.errors import (
     ClusterAwayError,
+    DivergedError,
     ImageError,
     InfrastructureError,
     OutputError,
@@ -170,6 +171,25 @@ def test_plan_is_logged_before_the_first_step(channel: io.StringIO, capsys: pyte
     report_prepared(Prepared([("scene", "616 Gaussians")], 3, 12))
     assert reports(channel) == [Report(prepared=True)]
     assert "scene: 616 Gaussians" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "traced"),
+    [
+        (DivergedError("The loss is not finite."), False),
+        (RanksFailedError("3 attempts came no further."), True),
+        (ZeroDivisionError("by zero"), True),
+    ],
+)
+def test_log_has_tracebacks_of_unexpected_errors_only(
+    error: Exception, traced: bool, channel: io.StringIO, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error.add_note("Worker 0 on here:\nTraceback (most recent call last):")
+    report_failure(error)
+    assert [report.ending for report in reports(channel)] == [failure(error)]
+    log = capsys.readouterr().err
+    assert str(error) in log
+    assert ("Worker 0" in log) == traced
 
 
 def test_long_running_job_writes_progress_less_often() -> None:
