@@ -77,7 +77,7 @@ from sgsst_core.regions import (
     where_property,
 )
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread, undistorted
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, normalized
@@ -354,16 +354,25 @@ def check_something_seen(scene: Scene, cameras: Sequence[Camera], rasterizer: Ra
         raise nothing_seen(scene.means, cameras, rasterizer.near)
 
 
+#: Views that are rendered to find whether cameras see anything, and Gaussians in all of them together.
+_MAX_VIEWS, _MAX_GAUSSIANS = 200, 50_000_000
+
+
 def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float) -> None:
     """Check that at least one camera sees a Gaussian, if possible without rendering.
 
-    Views are rendered only if the centers of Gaussians are in no view; see `shown_by`.
+    Views are rendered only if the centers of Gaussians are in no view (see `shown_by`), and from samples of Gaussians
+    and cameras if there are many, because a service limits the time to read inputs.
 
     Raises:
         CameraError: If no camera sees a Gaussian.
     """
-    if not shown_by(scene.means, cameras, near).together:
-        check_something_seen(scene, cameras, make_rasterizer("cpu", scene, near=near))
+    if shown_by(scene.means, cameras, near).together:
+        return
+    views = spread(cameras, _MAX_VIEWS)
+    rasterizer = make_rasterizer("cpu", sampled(scene, _MAX_GAUSSIANS // len(views)), near=near, memory=0)
+    if not any(sees_something(rasterizer.coverage(camera)) for camera in views):
+        raise nothing_seen(scene.means, cameras, near)
 
 
 def together(collectives: Collectives, make: Callable[[], T]) -> T:

@@ -150,6 +150,8 @@ def sampled(scene: Scene, count: int) -> Scene:
     The area of a Gaussian grows with the square of its size, so sizes are multiplied by the square root of the number
     of Gaussians that each one represents.
     """
+    if len(scene) <= count:
+        return scene
     sample = scene.subset(sampled_rows(len(scene), count))
     return replace(sample, scales=sample.scales + math.log(-(-len(scene) // count)) / 2)
 

@@ -14,13 +14,15 @@ from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.images import BLACK, check_names, find_masks, load_photo, save_png
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.planning.survey import shown_by
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene.camera import FACES
+from sgsst_core.scene.camera import FACES, look_at
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.objects import figure, ground, joined
-from tests.small_scenes import ball, cameras, wall, write_files
+from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
+from worker import inputs
 from worker.derived import video_cameras
 from worker.inputs import Capture, about_notes, about_rendering, choose_axes, read_capture, read_scene_and_capture
 from worker.job import SceneRequest
@@ -193,6 +195,16 @@ def test_panoramas_say_nothing_about_the_coordinate_frame(tmp_path: Path) -> Non
     assert [line.item for line in alone.checked(ball(), 0.2).decisions] == ["cameras"]
     with pytest.raises(CameraError, match="sees a Gaussian"):
         capture.checked(rotated(SCENE), 0.2)  # the pinhole sees nothing
+
+
+def test_cameras_between_the_centers_of_gaussians_see_a_sample_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inputs, "_MAX_GAUSSIANS", 2 * 154)
+    scene, up = wall(), torch.tensor([0.0, -1.0, 0.0])
+    close = look_at("close", torch.zeros(3), torch.tensor([0.0, 0.0, 3.0]), up, width=8, height=8, focal=400)
+    assert shown_by(scene.means, [close], 0.2).together == 0
+    inputs.check_something_in_view(scene, [blind_camera(), close], 0.2)
+    with pytest.raises(CameraError, match="None of the 2 cameras sees a Gaussian"):
+        inputs.check_something_in_view(scene, [blind_camera(), blind_camera()], 0.2)
 
 
 def test_videos_lead_through_the_front_faces_of_panoramas(tmp_path: Path) -> None:
