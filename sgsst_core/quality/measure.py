@@ -21,7 +21,7 @@ from sgsst_core.budget import memory_for
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.scene_file import losses, read_scene
-from sgsst_core.loss.sos import make_loss
+from sgsst_core.loss.sos import SosLoss, make_loss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.planning.survey import psnr
 from sgsst_core.quality.judge import Judge, Lpips, load_lpips_or_none
@@ -99,7 +99,7 @@ def _judged(stylizer: Stylizer, novel_views: NovelViews) -> dict[str, Any] | Non
 
 def make_novel_views(stylizer: Stylizer, *, lpips: Lpips | None = None, most: int = MAX_VIEWS) -> NovelViews:
     """Create the novel views of a job; their Gram distance is that of the paper's loss in float32 for every job."""
-    job, source = stylizer.job, Float32Reference(stylizer, style_loss="sos")
+    job, loss = stylizer.job, _float32_loss(stylizer, "sos")
     scene = job.scene.without_zero_bands()
     own = job.views.rasterizer.uncached  # caches the latest tile intersections only
     rasterizer = own.for_scene(scene, **own.options(0))
@@ -108,8 +108,8 @@ def make_novel_views(stylizer: Stylizer, *, lpips: Lpips | None = None, most: in
         job.views.covered,
         scene,
         rasterizer,
-        source.loss,
-        source.style_targets,
+        loss,
+        job.styles.cached_targets(loss),
         weighted=job.plan.weighted,
         lpips=lpips,
         most=most,
@@ -178,6 +178,17 @@ class GradientError(Difference):
     seconds_exact: float
 
 
+def _float32_loss(stylizer: Stylizer, style_loss: StyleLossName) -> SosLoss:
+    """Return a loss in float32, whose network is the job's if that is the same one."""
+    job = stylizer.job
+    settings = job.settings.model_copy(update={"style_loss": style_loss})
+    layers = layers_of(style_loss, job.weights, content=settings.content_weight > 0)
+    network = job.network
+    if job.plan.precision != "float32" or network.layers != layers:
+        network = FeatureNetwork(job.weights, layers, torch.float32, network.device)
+    return make_loss(network, settings, job.loss.memory, content_weight=job.loss.content_weight)
+
+
 class Float32Reference:
     """Exact loss and gradient of a job's colors in float32.
 
@@ -189,11 +200,7 @@ class Float32Reference:
 
     def __init__(self, stylizer: Stylizer, memory: int = 1 << 30, *, style_loss: StyleLossName | None = None) -> None:
         self._stylizer = stylizer
-        settings, weights, own = stylizer.job.settings, stylizer.job.weights, stylizer.job.loss
-        settings = settings.model_copy(update={"style_loss": style_loss or settings.style_loss})
-        layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0)
-        network = FeatureNetwork(weights, layers, torch.float32, stylizer.job.network.device)
-        self.loss = make_loss(network, settings, own.memory, content_weight=own.content_weight)
+        self.loss = _float32_loss(stylizer, style_loss or stylizer.job.settings.style_loss)
         self.style_targets = stylizer.job.styles.cached_targets(self.loss)
         rasterizer = stylizer.job.views.rasterizer.uncached
         self.seen = stylizer.job.plan.seen
@@ -203,7 +210,7 @@ class Float32Reference:
             rasterizer,
             covered=stylizer.job.plan.survey.covered,
             memory=memory,
-            clamp_aware_gradient=settings.clamp_aware_gradient,
+            clamp_aware_gradient=stylizer.job.settings.clamp_aware_gradient,
         )
         self.view_targets = ViewTargets(
             self.views,

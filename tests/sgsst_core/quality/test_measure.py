@@ -91,6 +91,16 @@ def test_float32_job_agrees_with_its_reference(tiny_weights: BackboneWeights) ->
     assert mean_loss(reference.evaluate([0, 1], stylizer.stylized())) == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.parametrize(("precision", "shared"), [("float32", True), ("winograd", False)])
+def test_reference_shares_the_network_of_a_float32_job(
+    tiny_weights: BackboneWeights, precision: str, shared: bool
+) -> None:
+    stylizer = prepared(tiny_weights, precision=precision)
+    network = Float32Reference(stylizer).loss.network
+    assert (network is stylizer.job.network) == shared
+    assert (network.precision, network.layers) == ("float32", stylizer.job.network.layers)
+
+
 def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) -> None:
     """The plan is constructed by hand, and TF32 is emulated, because a CPU would use float32."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12, warm_start=False)
