@@ -135,43 +135,37 @@ def approximations(stylizer: Stylizer) -> list[str]:
     return names
 
 
+def difference(actual: Tensor, exact: Tensor) -> tuple[float, float]:
+    """Return the `relative_error` and the `cosine` of a `GradientError` for two gradients of the same shape.
+
+    Computes in float64. If a value is not finite, the error is infinite.
+    """
+    error, length = (actual - exact).double().norm(), exact.double().norm()
+    product = float((actual.double() * exact.double()).sum())
+    lengths = float(actual.double().norm() * length)
+    if not math.isfinite(lengths):
+        return math.inf, 0.0
+    return (
+        float(error / length) if length > 0 else float(error > 0),
+        product / lengths if lengths > 0 else float(not error > 0),
+    )
+
+
 @dataclass(frozen=True)
-class Difference:
-    """Difference between two gradients.
+class GradientError:
+    """Error of a color gradient relative to the exact one, over all optimized Gaussians.
 
     Attributes:
         relative_error: |actual - exact| / |exact| in the Euclidean norm. If the exact gradient is 0, the error is 0 if
             the actual gradient is also 0, and 1 otherwise.
         cosine: Cosine of the angle between the gradients. If one gradient is 0, the cosine is 1 if both are 0, and 0
             otherwise.
-    """
-
-    relative_error: float
-    cosine: float
-
-    @staticmethod
-    def of(actual: Tensor, exact: Tensor) -> Difference:
-        """Compare two gradients of the same shape in float64. If a value is not finite, the error is infinite."""
-        error, length = (actual - exact).double().norm(), exact.double().norm()
-        product = float((actual.double() * exact.double()).sum())
-        lengths = float(actual.double().norm() * length)
-        if not math.isfinite(lengths):
-            return Difference(math.inf, 0.0)
-        return Difference(
-            float(error / length) if length > 0 else float(error > 0),
-            product / lengths if lengths > 0 else float(not error > 0),
-        )
-
-
-@dataclass(frozen=True)
-class GradientError(Difference):
-    """Error of a color gradient relative to the exact one, over all optimized Gaussians.
-
-    Attributes:
         step: Number of steps before the measurement.
         seconds: Seconds to compute the gradient with the job's approximations.
     """
 
+    relative_error: float
+    cosine: float
     step: int
     view: str
     seconds: float
@@ -259,9 +253,9 @@ class Float32Reference:
         colors = stylizer.job.scene.sh_dc if start else stylizer.stylized()
         approximate, seconds = stylizer.gradient(index, scales, colors[self.seen])
         exact, seconds_exact = self.gradient(index, colors, scales)
-        difference = Difference.of(approximate, exact[self.seen])
+        error = difference(approximate, exact[self.seen])
         step, view = 0 if start else stylizer.step, stylizer.job.views.cameras[index].name
-        return GradientError(difference.relative_error, difference.cosine, step, view, seconds, seconds_exact)
+        return GradientError(*error, step, view, seconds, seconds_exact)
 
 
 #: PSNR in dB below which the loss of a converted file is large. Real scenes have 47 or more.

@@ -10,7 +10,7 @@ import torch
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel import ALONE
 from sgsst_core.planning.plan import equip
-from sgsst_core.quality.measure import Difference, Float32Reference, Measurements, approximations
+from sgsst_core.quality.measure import Float32Reference, Measurements, approximations, difference
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import JobInputs, plan_job, prepare_job
@@ -144,5 +144,5 @@ def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) ->
 def test_difference_has_relative_error_and_cosine(
     actual: list[float], exact: list[float], error: float, cosine: float
 ) -> None:
-    difference = Difference.of(torch.tensor(actual), torch.tensor(exact))
-    assert (difference.relative_error, difference.cosine) == (pytest.approx(error), pytest.approx(cosine, abs=1e-12))
+    expected = pytest.approx(error), pytest.approx(cosine, abs=1e-12)
+    assert difference(torch.tensor(actual), torch.tensor(exact)) == expected
