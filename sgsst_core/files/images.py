@@ -523,14 +523,12 @@ class Photo:
     """Photo of a camera.
 
     Attributes:
-        size: Width and height in pixels, in the orientation that is used.
         oriented: Whether the EXIF orientation is applied. COLMAP ignores it, so it is used only if the photo does not
             fit its camera otherwise.
         ambiguous: Whether the photo would fit its camera in both orientations.
     """
 
     path: Path
-    size: tuple[int, int]
     oriented: bool = False
     ambiguous: bool = False
 
@@ -789,10 +787,10 @@ def _fitting(path: Path, camera: Camera) -> Photo:
     stored, orientation = stored_size(path)
     rotated = (stored[1], stored[0]) if orientation >= 5 else stored
     if fits(stored, camera):
-        return Photo(path, stored, ambiguous=orientation != 1 and fits(rotated, camera))
+        return Photo(path, ambiguous=orientation != 1 and fits(rotated, camera))
     if not fits(rotated, camera):
         raise _misfit(path, stored, camera)
-    return Photo(path, rotated, oriented=True)
+    return Photo(path, oriented=True)
 
 
 def _misfit(path: Path, size: tuple[int, int], camera: Camera) -> ImageError:

@@ -22,7 +22,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.files import camera_folder as colmap_model
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.camera_folder import cameras_beside
-from sgsst_core.files.images import check_photos, find_masks
+from sgsst_core.files.images import check_photos, find_masks, image_size
 from sgsst_core.scene.camera import FACES, Camera, cube_faces, look_at, undistorted
 from tests.small_scenes import LFS_POINTER
 
@@ -748,7 +748,7 @@ def test_half_size_photos_match_full_size_cameras(tmp_path: Path) -> None:
         cameras = read_cameras(CAPTURES / capture)
         for folder in (tmp_path, tmp_path / "images_2"):
             photos = check_photos(folder, cameras)
-            assert [photo and photo.size for photo in photos] == [(WIDTH // 2, HEIGHT // 2)] * 3
+            assert [photo and image_size(photo.path) for photo in photos] == [(WIDTH // 2, HEIGHT // 2)] * 3
 
 
 def test_project_prefers_its_first_model_and_own_transforms(tmp_path: Path) -> None:

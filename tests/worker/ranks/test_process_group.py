@@ -255,7 +255,7 @@ VALUES = [
         [],
         None,
         ("a",),
-        [Photo(Path("a.jpg"), (640, 480), oriented=True)],
+        [Photo(Path("a.jpg"), oriented=True)],
         (Decision("axes", "rub", "seen"),),
     ),
     Lens.of("OPENCV", (0.1, -0.02), (640, 480), (500.0, 500.0, 320.0, 240.0)),
