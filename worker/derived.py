@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from sgsst_core.errors import CameraError, OutputError, SceneError, SettingsError
+from sgsst_core.errors import OutputError, SceneError, SettingsError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import format_of_name, read_scene_header, scene_path
 from sgsst_core.files.formats.ply import PLY
@@ -477,8 +477,6 @@ def video_cameras(
         SettingsError: If there are no cameras, or an option of the turntable is out of range.
     """
     if through is not None:
-        if not through:
-            raise CameraError("A camera path needs at least one camera. Give some, or use the path orbit.")
         ahead = [camera for camera in through if camera.name == f"{camera.panorama}.front" or camera.panorama is None]
         path = CameraPath(in_path_order(ahead or through)).evenly(options.frames)
         side = side or min(DEFAULT_SIDE, max(path[0].width, path[0].height))

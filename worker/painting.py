@@ -11,7 +11,6 @@ from typing import Any
 
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from torch import Tensor
 
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.atomic import atomic_path, write_json
@@ -22,10 +21,10 @@ from sgsst_core.files.scene_file import SceneFile, write_colors, write_stylized
 from sgsst_core.painting import PASSES, Painted, PaintedView, paint
 from sgsst_core.progress import Decision, Progress
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.base import Color, Rasterizer
+from sgsst_core.rasterizer.base import Color
 from sgsst_core.report.document import PLAN_VERSION, REPORT_VERSION
 from sgsst_core.scene.camera import Camera, resized, spread
-from sgsst_core.scene.spherical_harmonics import scene_colors
+from sgsst_core.stylizing.refining import render
 from worker.execute import THUMBNAIL_SIDE, Prepared, describe_scene, save_thumbnail
 from worker.inputs import (
     STYLE_PIXELS,
@@ -107,8 +106,8 @@ def export_view(source: SceneRequest, name: str, background: Color, out: Path) -
     check_suffix(out, "a PNG image", f"{name}.png")
     file, capture = read_scene_and_capture(source)
     camera = camera_named(capture.cameras, name)
-    image = _render(make_rasterizer("cpu", file.scene, background=background, near=source.near), file, camera)
-    metadata = PngInfo()
+    rasterizer = make_rasterizer("cpu", file.scene, background=background, near=source.near)
+    image, metadata = render(file.scene, rasterizer, camera), PngInfo()
     metadata.add_text(_CHUNK, PaintedOptions(view=name, camera=_parameters(camera)).model_dump_json())
     with atomic_path(out) as temporary:
         to_image(image).save(temporary, format="PNG", pnginfo=metadata)
@@ -216,10 +215,6 @@ def camera_named(cameras: Sequence[Camera], name: str) -> Camera:
     raise CameraError(f"No view is called {name}. There are {len(cameras)}: {some}{', ...' * (len(cameras) > 5)}.")
 
 
-def _render(rasterizer: Rasterizer, file: SceneFile, camera: Camera) -> Tensor:
-    return rasterizer.render(scene_colors(file.scene, camera), camera)
-
-
 def _parameters(camera: Camera) -> CameraParameters:
     """Return the parameters of a camera, as a file states them."""
     given = {name: getattr(camera, name) for name in CameraParameters.model_fields if name != "world_to_camera"}
@@ -262,8 +257,8 @@ def run_painting(request: JobSpec, listener: Listener, options: WorkerOptions) -
     if options.preview_folder:
         camera = inputs.cameras[0]
         camera = resized(camera, min(camera.side, THUMBNAIL_SIDE))
-        after = replace(file, scene=replace(file.scene, sh_dc=painted.sh_dc))
-        save_thumbnail(options.preview_folder, *(_render(rasterizer, each, camera) for each in (file, after)))
+        scenes = file.scene, replace(file.scene, sh_dc=painted.sh_dc)
+        save_thumbnail(options.preview_folder, *(render(scene, rasterizer, camera) for scene in scenes))
     _write(request, inputs, painted, time.perf_counter() - started)
     return Result(
         stopped="finished",
