@@ -59,13 +59,6 @@ class Timer:
             self._open.pop()
             self._whole = outer
 
-    def clear(self) -> None:
-        """Discard all measurements; open blocks are measured from now on."""
-        self.seconds.clear()
-        self._marked.clear()
-        if self._open:
-            self._since = self._now()
-
     def lap(self) -> Timer:
         """Return a timer that has all measurements so far, to be read later, and continue with none."""
         earlier = Timer(self._device)

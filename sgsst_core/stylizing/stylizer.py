@@ -617,7 +617,7 @@ class Stylizer:
         """
         started = time.perf_counter()
         self._stylized = None
-        self.job.loss.timer.clear()
+        self.job.loss.timer.lap()  # without what was measured between steps
         self._cache_visited()
         phase = self.phase
         views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
