@@ -46,8 +46,6 @@ def basis(
     degree: int,
 ) -> Tensor:
     """Return the real spherical harmonics of degrees 1 to `degree` (at most 3): [..., (degree + 1)^2 - 1]."""
-    if not 0 <= degree <= 3:
-        raise ValueError(f"spherical harmonics of degree {degree}: 3DGS scenes have 0 to 3")
     terms = spherical_harmonics(*directions.unbind(-1))[: (degree + 1) ** 2 - 1]
     return torch.stack(terms, dim=-1) if terms else directions.new_zeros((*directions.shape[:-1], 0))
 
