@@ -76,10 +76,6 @@ def disk_errors() -> Iterator[None]:
         raise problem(f"The service cannot write the file: {cause.strerror}.") from error
 
 
-class TruncatedError(OSError):
-    """Object with fewer bytes than expected."""
-
-
 class ObjectStore:
     """Objects of a file store; their names are relative to its URL.
 
@@ -129,7 +125,7 @@ class ObjectStore:
         From S3, 32 chunks are fetched at a time; by default, the file system fetches 50 MB.
 
         Raises:
-            TruncatedError: If the object ends before `stop`.
+            FileNotFoundError: If there is no such object, or it ends before `stop`.
         """
         with self._translated(name), self._files.open(self._path(name), "rb", block_size=32 * chunk) as file:
             file.seek(start)
@@ -137,7 +133,7 @@ class ObjectStore:
             while left > 0:
                 data = _uninterrupted(partial(file.read, min(chunk, left)))
                 if not data:
-                    raise TruncatedError(f"{name}: is shorter than its row says")
+                    raise FileNotFoundError(f"{name}: is shorter than its row says")
                 left -= len(data)
                 yield data
 
@@ -263,7 +259,7 @@ class ObjectStore:
         """
         try:
             yield
-        except (TruncatedError, StoreError):
+        except StoreError:
             raise
         except Exception as error:
             if self.local or (isinstance(error, FileNotFoundError) and (not self._s3 or self._exists())):

@@ -195,6 +195,16 @@ def test_upload_continues_on_another_host(fleet: Fleet) -> None:
     assert two.finish_upload(fleet.again(upload), HOUR) == sha256, "another request has finished it already"
 
 
+def test_upload_with_a_truncated_part_has_to_be_started_again(fleet: Fleet) -> None:
+    host, upload = fleet.host("one"), fleet.upload(9)
+    fleet.append(host, upload, b"the scene")
+    (name,) = fleet.names()
+    fleet.objects.put(_file(fleet.folder, b"the"), name)
+    with raises_problem(problems.LOST_UPLOAD, "gone"):
+        host.finish_upload(fleet.again(upload), HOUR)
+    assert list(host.incoming.iterdir()) == []
+
+
 def test_one_of_two_concurrent_writers_gets_a_conflict(fleet: Fleet) -> None:
     upload = fleet.upload(30)
     slow, fast = fleet.host("one").append(upload, HOUR), fleet.host("two").append(upload, HOUR)
