@@ -33,7 +33,7 @@ from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import OutputError, SceneError, SettingsError, reading_scene
-from sgsst_core.files.atomic import DISK_FULL, atomic_path
+from sgsst_core.files.atomic import DISK_FULL, atomic_path, ensure_writable_folder
 from sgsst_core.files.formats import read_scene_header, scene_path
 from sgsst_core.files.formats.ply import (
     FILTER_3D,
@@ -273,7 +273,7 @@ def _unpack(file: Path | BinaryIO, folder: Path) -> int:
     with zipfile.ZipFile(file) as archive:
         for entry in archive.infolist():
             target = folder / entry.filename
-            target.parent.mkdir(parents=True, exist_ok=True)
+            ensure_writable_folder(target.parent)
             with atomic_path(target) as temporary:
                 temporary.write_bytes(archive.read(entry))
         return sum(entry.file_size for entry in archive.infolist())

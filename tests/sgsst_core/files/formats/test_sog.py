@@ -341,6 +341,13 @@ def test_nothing_is_written_if_a_coarse_level_is_damaged(tmp_path: Path, target:
     assert list((tmp_path / "out").iterdir()) == []
 
 
+def test_folder_of_a_part_that_cannot_be_created_is_named(tmp_path: Path) -> None:
+    original = archived(tmp_path / "scene.zip", three_levels())
+    (tmp_path / "2_0").touch()
+    with pytest.raises(OutputError, match="2_0: cannot be used as output folder: there is a file of that name"):
+        write_levels(tmp_path / "lod-meta.json", read_scene(original).scene, original)
+
+
 HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "folder above": (
         lambda index: index["filenames"].__setitem__(0, "../0_0/meta.json"),
