@@ -623,10 +623,7 @@ async def create_job(
             with suspended():  # fetching has its own deadline
                 fetched |= await context.fetcher.fetch(urls, receipt)
         inputs, rows = await context.threads.run(caller.owner, find_inputs, fetched)
-        recall = partial(context.inspector.recall, "validate", caller.owner, inputs, parameters)
-        findings = await context.threads.run(caller.owner, recall)
-        if findings is None:
-            findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
+        findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
             up, foreign = (findings["up"], findings["foreign"]) if sure_up else (None, None)
             if foreign:

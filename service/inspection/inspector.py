@@ -237,17 +237,6 @@ class Inspector:
         for feature in missing():
             _log.warning("confinement incomplete: missing %s", feature)
 
-    def recall(
-        self, work: Work, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
-    ) -> dict[str, Any] | None:
-        """Return the stored finding of `inspect` for the same owner and inputs; None if there is none.
-
-        Raises:
-            INVALID_INPUT: If the stored finding is a rejection.
-        """
-        known = self._store.inputs.inspection(_key(self._settings, work, owner, inputs, parameters))
-        return None if known is None else findings_of(known)
-
     async def inspect(
         self,
         work: Work,
@@ -257,7 +246,7 @@ class Inspector:
         parameters: JobParameters,
         show: Show = lambda now: None,
     ) -> dict[str, Any]:
-        """Return the findings of `service.inspection.process` about a job's inputs.
+        """Return the findings of `service.inspection.process` about a job's inputs, from an earlier check if possible.
 
         Args:
             work: Task; inputs that are planned are validated first.
@@ -271,9 +260,10 @@ class Inspector:
             INVALID_INPUT: If the inputs cannot be used.
             BUSY: If the inputs cannot be checked now.
         """
-        recalled = await asyncio.to_thread(self.recall, work, owner, inputs, parameters)
-        if recalled is not None:
-            return recalled
+        key = await asyncio.to_thread(_key, self._settings, work, owner, inputs, parameters)
+        known = await asyncio.to_thread(self._store.inputs.inspection, key)
+        if known is not None:
+            return findings_of(known)
         seconds = self._settings.inspection_seconds + _SECONDS_PER_BYTE * _size(inputs)
         if work == "plan" or parameters.renders_views:
             seconds += self._settings.dry_run_seconds
@@ -305,7 +295,6 @@ class Inspector:
                     await self._threads.run(owner, _store_plan, folder / PLAN, target)
         transient = answer.get("error", {}).get("code") in (problems.INSPECTION_LIMIT.code, WeightsError.code)
         if not transient:  # a later check may succeed
-            key = _key(self._settings, work, owner, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
         return findings_of(answer)
 
