@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import fcntl
 import hashlib
-import logging
 import os
 import secrets
 import shutil
@@ -28,8 +27,6 @@ from service.settings import ServiceSettings
 from service.store.files import BLOBS, UPLOADS, InputRows, check_offset
 from service.store.tables import BlobRow, UploadRow
 from sgsst_core.files.atomic import file_digest, flush_folder
-
-_log = logging.getLogger(__name__)
 
 #: Minimum number of free inodes, since both requests and the database create files.
 _MIN_FREE_INODES = 1000
@@ -153,12 +150,8 @@ class Blobs(ABC):
         """
 
     def remove(self, locations: Iterable[str]) -> None:
-        """Remove the files of blobs whose rows have been deleted; housekeeping removes what the store holds back."""
-        for location in locations:
-            try:
-                self.objects.remove(f"{BLOBS}/{location}")
-            except StoreError as error:
-                _log.warning("unused input not deleted yet: name=%s error=%s", location, error.__cause__)
+        """Remove the files of blobs whose rows have been deleted, as `ObjectStore.discard` does."""
+        self.objects.discard(f"{BLOBS}/{location}" for location in locations)
 
     def _register(self, sha256: str, location: str, size: int, upload_id: str | None) -> str:
         """Register a stored file as a blob, and return the blob's location: another one if its content is known.

@@ -17,7 +17,7 @@ import secrets
 import shutil
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from functools import partial
@@ -205,6 +205,14 @@ class ObjectStore:
         """Remove an object if it exists."""
         with self._translated(name), contextlib.suppress(FileNotFoundError):
             self._files.rm_file(self._path(name))
+
+    def discard(self, names: Iterable[str]) -> None:
+        """Remove objects that no database row refers to any longer; after an error, housekeeping removes the others."""
+        try:
+            for name in names:
+                self.remove(name)
+        except (StoreError, OSError) as error:
+            _log.warning("unused files not deleted yet: %s", error.__cause__ or error)
 
     def remove_below(self, folder: str) -> None:
         """Remove all objects in a folder."""

@@ -198,8 +198,7 @@ class DerivedFiles:
         else:
             await self.poster(job, chosen["start"], quotas)
         unused = await asyncio.to_thread(self._store.jobs.set_viewpoints, job.id, chosen, outdated)
-        for location in unused:
-            await self._threads.run(job.owner, self._artifacts.objects.remove, location)
+        await self._threads.run(job.owner, self._artifacts.objects.discard, unused)
 
     async def video(self, job: JobRow, options: JobVideo, quotas: Quotas, show: Show = lambda now: None) -> ArtifactRow:
         """Render a video of a job's result, which replaces an earlier one, and return it.
@@ -323,5 +322,4 @@ class DerivedFiles:
                 put.append(self._artifacts.put(job.id, job.lease_epoch + 1, name, path, final=True))
             unused = self._store.jobs.add_derived(result, put, job.owner, quotas)
         finally:
-            for location in [file.location for file in put] if unused is None else unused:
-                self._artifacts.objects.remove(location)
+            self._artifacts.objects.discard([file.location for file in put] if unused is None else unused)

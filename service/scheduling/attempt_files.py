@@ -169,15 +169,7 @@ class Publisher:
         self._results |= {file.name: file for file in files if file.name in RESULTS}
         now = [file for file in files if file.name not in RESULTS]
         if now:
-            self._remove(self._store.leases.publish(self._lease, now))
-
-    def _remove(self, locations: Sequence[str]) -> None:
-        """Remove replaced files; those that remain are swept when the job has ended."""
-        try:
-            for location in locations:
-                self._artifacts.objects.remove(location)
-        except StoreError as error:
-            _log.warning("replaced files not deleted yet: %s", _reason(error), extra=self._lease.log_fields)
+            self._artifacts.objects.discard(self._store.leases.publish(self._lease, now))
 
     def _grown_log(self, *, now: bool) -> dict[str, Path]:
         """Return a copy of the log if one is due, because the process keeps writing to the log itself."""
