@@ -1,6 +1,6 @@
 """Limits of the time that work may take: the deadline of a request, and threads for work on files, which may hang.
 
-In addition, the patience of a starting process with a database or a file store that does not answer yet.
+In addition, the patience with a database or a file store that does not answer, at the start and at the end of a job.
 
 A request ends some time after its last sign of progress, whatever it waits for. The code that serves it extends the
 deadline for large files, and suspends it for work that has a limit of its own; outside of requests, both do nothing.
@@ -26,12 +26,12 @@ from typing import Any, TypeVar
 from weakref import WeakValueDictionary
 
 from service import problems
-from service.problems import DatabaseUnavailableError, StoreError
+from service.problems import DatabaseUnavailableError, NoSpaceError, StoreError
 
 _log = logging.getLogger(__name__)
 
 #: Interval in seconds between attempts of `until_answered`.
-_RETRY_SECONDS = 1.0
+_RETRY_SECONDS = 2.0
 #: Minimum rate of work on files in bytes per second; it adds to the time that work on a file of known size may take.
 LEAST_RATE = 10e6
 
@@ -180,22 +180,23 @@ def _release(loop: asyncio.AbstractEventLoop, free: asyncio.Semaphore, _done: An
         loop.call_soon_threadsafe(free.release)
 
 
-def until_answered(function: Callable[[], None], patience: float) -> None:
-    """Call a function, and repeat it while a database server or a file store does not answer.
+def until_answered(function: Callable[[], None], patience: float, given_up: Callable[[], bool] = lambda: False) -> None:
+    """Call a function, and repeat it while a database server or a file store does not answer, or a disk is full.
 
     Args:
         patience: Seconds after which its error is raised; services may start before what they need.
+        given_up: Callback that returns whether to stop waiting; it is called after each error.
 
     Raises:
-        DatabaseUnavailableError, StoreError: If there is no answer by then.
+        DatabaseUnavailableError, StoreError, NoSpaceError: If there is no answer by then.
     """
     until = time.monotonic() + patience
     while True:
         try:
             function()
             return
-        except (DatabaseUnavailableError, StoreError) as error:
-            if time.monotonic() >= until:
+        except (DatabaseUnavailableError, StoreError, NoSpaceError) as error:
+            if given_up() or time.monotonic() >= until:
                 raise
             _log.warning("no answer, retrying: %s", error.__cause__ or error)
             time.sleep(_RETRY_SECONDS)

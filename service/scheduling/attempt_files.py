@@ -25,6 +25,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from service import problems
+from service.deadlines import until_answered
 from service.files.blobs import open_cache
 from service.files.objects import Artifacts, ObjectStore, disk_errors, locked
 from service.inputs import CHECKPOINT, RESULT, stage
@@ -205,23 +206,15 @@ class Publisher:
         return (self._folder / "log.txt").read_bytes()[-_LOG_TAIL:].decode(errors="replace")
 
 
-def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Published]:
+def put_patiently(outbox: Outbox, given_up: Callable[[], bool] = lambda: False) -> list[Published]:
     """Upload a job's results; retry failed uploads, because the results would be lost otherwise.
 
     Raises:
         StoreError, NoSpaceError: If the file store was unreachable or full for too long, or `given_up` returned true.
     """
-    started = time.monotonic()
     done: list[Published] = []
-    while True:
-        try:
-            outbox.put(outbox.results(), done.append)
-            return done
-        except (StoreError, NoSpaceError) as error:
-            if given_up() or time.monotonic() - started > PATIENCE_SECONDS:
-                raise
-            _log.warning("upload of results failed, retrying: %s", _reason(error))
-        time.sleep(_RETRY_SECONDS)
+    until_answered(lambda: outbox.put(outbox.results(), done.append), PATIENCE_SECONDS, given_up)
+    return done
 
 
 def _reason(error: Exception) -> str:
@@ -341,7 +334,7 @@ class _Uploader:
     def finish(self, *, done: bool) -> None:
         self.stop()
         if done:
-            for file in put_patiently(self._outbox, lambda: False):
+            for file in put_patiently(self._outbox):
                 self._report(file)
         try:
             self._upload()
