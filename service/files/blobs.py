@@ -393,7 +393,7 @@ def write_all(file: object, data: bytes) -> None:
 
 def open_blobs(settings: ServiceSettings, inputs: InputRows, artifacts: Artifacts) -> Blobs:
     """Return the store of inputs: the data folder if the file store is a local folder, otherwise the file store."""
-    if artifacts.local:
+    if artifacts.objects.local:
         return BlobFolder(settings.folder, inputs, settings.min_free_bytes)
     return StoredBlobs(settings, inputs, artifacts.objects)
 

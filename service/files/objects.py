@@ -468,8 +468,7 @@ class Artifacts:
 
     def __init__(self, url: str) -> None:
         self.objects = ObjectStore(url)
-        self.local = self.objects.local
-        if self.local:
+        if self.objects.local:
             Path(self.objects.root).mkdir(parents=True, exist_ok=True)
 
     @disk_errors()
@@ -483,7 +482,7 @@ class Artifacts:
                 A final file is hard-linked instead of copied if the file store is on the same file system.
         """
         location = f"{job_id}/{epoch}/{secrets.token_hex(6)}/{name}"
-        if not self.local:
+        if not self.objects.local:
             with _snapshot(source) as snapshot:
                 size, sha256 = snapshot.stat().st_size, file_digest(snapshot)
                 self.objects.put(snapshot, location)

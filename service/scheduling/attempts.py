@@ -149,7 +149,7 @@ def prepare(
     out.mkdir(parents=True)
     checkpoint = store.jobs.artifact(job.id, CHECKPOINT)
     rows = store.inputs.blobs(sorted({entry["sha256"] for entry in job.inputs}))
-    if cluster and not artifacts.local and not spec.paintings:
+    if cluster and not artifacts.objects.local and not spec.paintings:
         workplace = _workplace(artifacts.objects, lease, rows, checkpoint)
     else:
         if checkpoint is not None:

@@ -44,7 +44,7 @@ def test_final_file_is_linked_and_others_are_copied(artifacts: Artifacts, tmp_pa
     source = tmp_path / "checkpoint"
     source.write_bytes(b"first")
     put = artifacts.put("job_1", 1, ".checkpoint", source, final=True)
-    assert source.stat().st_nlink == (2 if artifacts.local else 1)
+    assert source.stat().st_nlink == (2 if artifacts.objects.local else 1)
     later = tmp_path / "later"
     later.write_bytes(b"second")
     later.replace(source)
