@@ -206,8 +206,6 @@ async def create_upload(
         idempotency_key,
         caller.quotas,
     )
-    if row.sha256 is None:  # a repeated request may refer to an upload that is already complete
-        await context.threads.run(caller.owner, context.blobs.start_upload, row.id)
     response_headers = {
         **_HEADERS,
         "Location": address(f"/v1/uploads/{row.id}"),

@@ -179,9 +179,6 @@ class Blobs(ABC):
             StoreError: If the file store does not respond.
         """
 
-    def start_upload(self, upload_id: str) -> None:  # noqa: B027 (nothing to prepare by default)
-        """Prepare for receiving the bytes of a new upload, whose database row exists already."""
-
     @abstractmethod
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
         """Return a writer of an upload's next bytes.
@@ -272,11 +269,6 @@ class BlobFolder(Blobs):
             self.objects.check(f"{BLOBS}/{row.location}", sha256)
         return {sha256: self._blobs / row.location for sha256, row in rows.items()}
 
-    def start_upload(self, upload_id: str) -> None:
-        """Create an empty file for the upload."""
-        with disk_errors():
-            open_file(self.upload_path(upload_id), "ab").close()
-
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
         """Return a writer to the upload's file."""
         return _FileWriter(self.upload_path(upload.id), self._inputs, upload, seconds)
@@ -313,7 +305,7 @@ class _FileWriter(PartWriter):
     def __init__(self, path: Path, inputs: InputRows, upload: UploadRow, seconds: float) -> None:
         try:
             with disk_errors():
-                file = open_file(path, "r+b")
+                file = open_file(path, "r+b" if upload.offset else "a+b")  # the first writer creates it
         except FileNotFoundError:
             raise problems.LOST_UPLOAD(upload_id=upload.id) from None
         except StoreError:

@@ -95,7 +95,6 @@ class Files:
 
     def upload(self, content: bytes, length: int) -> str:
         row = self.store.inputs.create_upload("me", length, "scene.ply", "", HOUR)
-        self.blobs.start_upload(row.id)
         writer = self.blobs.append(row, HOUR)
         writer.write(content)
         writer.save()

@@ -401,8 +401,7 @@ def blob_folder(tmp_path: Path) -> Iterator[tuple[InputRows, BlobFolder]]:
 def test_upload_that_becomes_a_blob_is_locked(tmp_path: Path) -> None:
     with blob_folder(tmp_path) as (inputs, blobs):
         row = inputs.create_upload("me", 5, "scene.ply", "", 3600)
-        blobs.start_upload(row.id)
-        blobs.upload_path(row.id).chmod(0o400)
+        blobs.upload_path(row.id).touch(0o400)
         inputs.advance_upload(row.id, 0, 5, 3600)
         with unprivileged(), raises_problem(problems.UPLOAD_LOCKED):
             blobs.append(row, 3600)
@@ -411,13 +410,11 @@ def test_upload_that_becomes_a_blob_is_locked(tmp_path: Path) -> None:
 def test_missing_write_permission_is_a_failure_of_the_store(tmp_path: Path) -> None:
     with blob_folder(tmp_path) as (inputs, blobs):
         row = inputs.create_upload("me", 5, "scene.ply", "", 3600)
-        blobs.start_upload(row.id)
         received = blobs.receive(10)
         received.close()
         with unprivileged():
             for write in (
                 lambda: blobs.append(row, 3600),
-                lambda: blobs.start_upload("upl_1"),
                 lambda: blobs.receive(10),
                 lambda: blobs.add(received.path),
             ):
