@@ -155,9 +155,8 @@ class InputRows:
         Raises:
             NotFoundError: If there is no such upload.
         """
-        with self.database.reading() as session:
-            row = session.get(UploadRow, upload_id)
-        if row is None or row.owner != owner or row.expires_at < self.database.clock():
+        row = self.uploads([upload_id], owner).get(upload_id)
+        if row is None:
             raise problems.NO_UPLOAD(upload_id=upload_id)
         return row
 
