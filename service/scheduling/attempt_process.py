@@ -39,7 +39,7 @@ def run(task: Task) -> None:
     stopping, finishing = threading.Event(), threading.Event()
     signal.signal(signal.SIGTERM, lambda number, frame: stopping.set())
     signal.signal(signal.SIGUSR1, lambda number, frame: finishing.set())
-    report_progress(Progress(stage="reading"))
+    send(Report(progress=Progress(stage="reading")))
     try:
         result = _stylize(task, stopping, finishing)
     except Exception as error:
@@ -54,7 +54,7 @@ def _stylize(task: Task, stopping: threading.Event, finishing: threading.Event) 
 
     listener = Listener(
         prepared=report_prepared,
-        progress=report_progress,
+        progress=lambda now: send(Report(progress=now)),
         warn=log,
         stop=stopping.is_set,
         finish=finishing.is_set,
@@ -83,11 +83,6 @@ def report_failure(error: Exception) -> None:
         log(f"error: {error}")
     else:  # unexpected, as is what made ranks fail
         traceback.print_exception(error)
-
-
-def report_progress(now: Progress) -> None:
-    """Report the progress of the job."""
-    send(Report(progress=now))
 
 
 def report_prepared(prepared: Prepared) -> None:

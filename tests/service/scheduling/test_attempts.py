@@ -18,7 +18,7 @@ from service.files.objects import Artifacts
 from service.problems import NoSpaceError
 from service.scheduling import attempt_process
 from service.scheduling.attempt_files import Outbox, Publisher, sweep
-from service.scheduling.attempt_process import report_failure, report_prepared, report_progress
+from service.scheduling.attempt_process import report_failure, report_prepared, send
 from service.scheduling.attempts import progress_seconds
 from service.scheduling.messages import Ending, Report, StopRequest, attempt_ending, cause_of_error, failure, outage
 from service.settings import ServiceSettings
@@ -163,7 +163,7 @@ def test_dispatcher_gets_progress_unchanged(channel: io.StringIO) -> None:
         Progress(stage="measuring", step=60, total=60, loss=0.5, views_checked=3, views_to_check=8),
     ]
     for each in sent:
-        report_progress(each)
+        send(Report(progress=each))
     assert [report.progress for report in reports(channel)] == sent
 
 
