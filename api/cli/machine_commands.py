@@ -348,7 +348,7 @@ def usage_of_all(data: Path, since: str | None, until: str | None) -> list[dict[
     except ValueError as error:
         raise SettingsError(f"--since, --until: {error}. Give a day such as 2026-11-21.") from error
     rows = _open_existing_store(data).keys.usage(first, last, None)
-    return [asdict(row) | {"day": row.day.isoformat()} for row in rows]
+    return [row | {"day": row["day"].isoformat()} for row in rows]
 
 
 def _service_settings(data: Path | None) -> ServiceSettings:

@@ -243,7 +243,7 @@ def get_usage(
 ) -> UsageList:
     """Get the usage of this key by day, or with an operator's key that of all keys, for at most 92 days."""
     rows = context.store.keys.usage(since, until, None if caller.operator else caller.owner)
-    return UsageList(usage=[UsageView(**vars(row)) for row in rows])
+    return UsageList(usage=[UsageView(**row) for row in rows])
 
 
 @router.get(

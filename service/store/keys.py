@@ -68,24 +68,6 @@ class Quotas:
 NO_QUOTAS = Quotas()
 
 
-@dataclass(frozen=True)
-class Usage:
-    """Usage of one key on one day; see `UsageRow`.
-
-    Attributes:
-        name: Name of the key; empty without a key.
-        key: Owner of the jobs: the id of the key.
-    """
-
-    day: date
-    name: str
-    key: str
-    jobs: int
-    gpu_seconds: float
-    cpu_seconds: float
-    bytes: int
-
-
 #: Day 0, maximum number of days of a report of usage, and their number by default.
 _FIRST_DAY, MOST_USAGE_DAYS, _USUAL_DAYS = date(1970, 1, 1), 92, 30
 
@@ -238,8 +220,10 @@ class Keys:
             row.revoked_at = row.revoked_at or self._database.clock()
             return row
 
-    def usage(self, since: date | None, until: date | None, owner: str | None) -> list[Usage]:
+    def usage(self, since: date | None, until: date | None, owner: str | None) -> list[dict[str, Any]]:
         """Return the usage of each day (UTC), oldest first, by owner; days without usage are left out.
+
+        Each entry has `day`, `key` (the owner), `name` (of the key; empty without one), and the amounts of `UsageRow`.
 
         Args:
             since: First day; None for the 30 days up to `until`.
@@ -263,7 +247,12 @@ class Keys:
             query = query.where(_USAGE.c.owner == owner)
         with self._database.reading_rows() as connection:
             rows = connection.execute(query).all()
-        return [Usage(_FIRST_DAY + timedelta(day), name or "", owner, *amounts) for owner, day, *amounts, name in rows]
+        amounts = ("jobs", "gpu_seconds", "cpu_seconds", "bytes")
+        return [
+            {"day": _FIRST_DAY + timedelta(row.day), "key": row.owner, "name": row.name or ""}
+            | {name: row._mapping[name] for name in amounts}
+            for row in rows
+        ]
 
     def find(self, text: str) -> KeyRow | None:
         """Return the key with this text; None if it is unknown or revoked."""

@@ -9,7 +9,7 @@ from service.problems import NotFoundError, ServiceError
 from service.states import Published
 from service.store import Store
 from service.store.files import GRACE_SECONDS
-from service.store.keys import NO_QUOTAS, Quotas, Usage
+from service.store.keys import NO_QUOTAS, Quotas
 from tests.raised import raises_problem
 from tests.service.store.helpers import LEASE, SHA, Clock, Used, at_once, lease, new_job, queue, usage_of
 
@@ -93,8 +93,10 @@ def test_usage_is_reported_by_day_and_key(store: Store, clock: Clock) -> None:
     clock.now += 7
     store.leases.fail(on_cpu, {"code": "x", "message": "x"}, permanent=True)
     store.jobs.delete(job_id, key.id)  # which changes nothing of what was used
-    first = Usage(date(1970, 4, 11), "alice", key.id, 1, 20.0, 0.0, 7)
-    second = Usage(date(1970, 4, 12), "", "local", 1, 0.0, 7.0, 3)
+    first = {"day": date(1970, 4, 11), "key": key.id, "name": "alice", "jobs": 1, "gpu_seconds": 20.0}
+    first |= {"cpu_seconds": 0.0, "bytes": 7}
+    second = {"day": date(1970, 4, 12), "key": "local", "name": "", "jobs": 1, "gpu_seconds": 0.0}
+    second |= {"cpu_seconds": 7.0, "bytes": 3}
     assert store.keys.usage(None, None, None) == [first, second]
     assert store.keys.usage(None, None, key.id) == [first]
     assert store.keys.usage(date(1970, 4, 12), None, None) == [second]
