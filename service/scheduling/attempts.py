@@ -221,7 +221,6 @@ class RunningAttempt:
         self._prepare, self._cluster = prepare, cluster
         self._process: ChildProcess | None = None
         self._stop_request: StopRequest | None = None
-        self._finish_requested = False
         self._publisher = Publisher(lease, folder, store, artifacts, settings.preview_seconds)
         self._progress = ProgressWriter(lease, store)
         # Work on files has a thread of its own, because it may hang: the attempt then ends without it.
@@ -244,8 +243,8 @@ class RunningAttempt:
         """Do what the job's status asks for on behalf of its user: stop, or end with the present colors as result."""
         if status == JobStatus.CANCELING:
             self._stop_request = self._stop_request or StopRequest.CANCEL
-        elif status == JobStatus.FINISHING:
-            self._finish_requested = True
+        elif status == JobStatus.FINISHING and self._process is not None:
+            self._process.finish()
 
     def release(self) -> None:
         """Save the job's state and return it to the queue, because the dispatcher is shutting down."""
@@ -355,8 +354,6 @@ class RunningAttempt:
             self._check_published()
             if not self._pending:
                 self._pending.append(self._files.submit(self._publisher.publish_unfinished))
-            if self._finish_requested:
-                process.finish()
             if self._stop_request is not None:
                 process.stop(
                     _CANCEL_SECONDS if self._stop_request == StopRequest.CANCEL else self._settings.stop_seconds
