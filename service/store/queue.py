@@ -449,7 +449,7 @@ class Leases:
     ) -> Transition:
         """Close an attempt, then end its job or queue it again; return the job's transition."""
         _close_attempt(session, job, outcome, error, now)
-        causes = _causes(session, job) or [cause_of(error)]
+        causes = _causes(session, job)
         if causes[0] not in (Cause.JOB, Cause.DISPATCHER):
             count(session, "sgsst_outages_total", f'cause="{causes[0]}"')
         transition, wait = self._policy.after_attempt(outcome, job, causes, permanent=permanent)
@@ -514,14 +514,13 @@ def _causes(session: Session, job: JobRow) -> list[Cause]:
 def _close_attempt(
     session: Session, job: JobRow, outcome: AttemptOutcome, error: dict[str, Any] | None, now: float
 ) -> None:
-    attempt = session.get(AttemptRow, (job.id, job.attempt))
-    if attempt is not None:
-        attempt.finished_at, attempt.outcome, attempt.error = now, outcome, error
-        if outcome != AttemptOutcome.LOST:  # its working time is unknown, and the loss is not the owner's fault
-            if attempt.gpus_since is not None:
-                add_usage(session, job.owner, now, gpu_seconds=attempt.gpus * max(0.0, now - attempt.gpus_since))
-            else:
-                add_usage(session, job.owner, now, cpu_seconds=max(0.0, now - attempt.started_at))
+    attempt = session.get_one(AttemptRow, (job.id, job.attempt))
+    attempt.finished_at, attempt.outcome, attempt.error = now, outcome, error
+    if outcome != AttemptOutcome.LOST:  # its working time is unknown, and the loss is not the owner's fault
+        if attempt.gpus_since is not None:
+            add_usage(session, job.owner, now, gpu_seconds=attempt.gpus * max(0.0, now - attempt.gpus_since))
+        else:
+            add_usage(session, job.owner, now, cpu_seconds=max(0.0, now - attempt.started_at))
     count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')
 
 
