@@ -515,18 +515,6 @@ class Artifacts:
         except FileNotFoundError as error:
             raise problems.FILE_LOST(sha256=sha256) from error
 
-    def sweep(self, job_id: str, epoch: int, retained: set[str]) -> None:
-        """Remove files that interrupted attempts at a job left behind and that no database row refers to.
-
-        Args:
-            epoch: Latest lease epoch whose files are removed; files of later leases may not have their rows yet.
-            retained: Locations that database rows refer to; their files are not removed.
-        """
-        for location in self.objects.below(job_id):
-            below = location.partition("/")[2]
-            if location not in retained and int(below.partition("/")[0]) <= epoch:
-                self.objects.remove(location)
-
 
 def media_type(name: str) -> str:
     """Return the media type of a result for HTTP."""

@@ -223,16 +223,6 @@ def _reason(error: Exception) -> str:
     return f"{error} ({type(cause).__name__}: {cause})" if cause is not None else str(error)
 
 
-def sweep(store: Store, artifacts: Artifacts, job_id: str, epoch: int) -> None:
-    """Remove leftovers of all attempts at an ended job.
-
-    Args:
-        epoch: Epoch of the job's last lease.
-    """
-    artifacts.sweep(job_id, epoch, {row.location for row in store.jobs.artifacts(job_id)})
-    store.jobs.mark_swept(job_id, epoch)
-
-
 # --- on machines that share only the file store -------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
@@ -21,7 +21,6 @@ from service.files.blobs import Blobs, open_blobs
 from service.files.objects import Artifacts, ObjectStore
 from service.inputs import CHECKPOINT
 from service.problems import NotFoundError
-from service.scheduling.attempt_files import sweep
 from service.settings import ServiceSettings
 from service.states import UNFINISHED
 from service.store import Store
@@ -40,7 +39,9 @@ def clean_up(store: Store, artifacts: Artifacts, blobs: Blobs) -> None:
         artifacts.objects.remove_below(job_id)
     while ended := store.jobs.unswept(_MAX_SWEEPS):
         for job_id, epoch in ended:
-            sweep(store, artifacts, job_id, epoch)
+            for name in _strays(store, job_id, artifacts.objects.below(job_id), epoch):
+                artifacts.objects.remove(name)
+            store.jobs.mark_swept(job_id, epoch)
     blobs.collect()
 
 
@@ -70,17 +71,19 @@ def orphans(store: Store, artifacts: Artifacts, blobs: Blobs) -> Iterator[tuple[
 
 
 def _strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
-    """Return the files of a job that no database row refers to or will refer to."""
+    """Return the old files of a job that no database row refers to or will refer to."""
     try:
         job = store.jobs.get(job_id, None)
     except NotFoundError:
         return names
+    # the running attempt may still write rows; earlier ones cannot. Files derived from a result have the next epoch.
+    return _strays(store, job_id, names, job.lease_epoch + (-1 if job.status in UNFINISHED else 1))
+
+
+def _strays(store: Store, job_id: str, names: Iterable[str], epoch: int) -> list[str]:
+    """Return the files of a job that no database row refers to, except those of later leases than `epoch`."""
     known = {row.location for row in store.jobs.artifacts(job_id)}
-    unknown = [name for name in names if name not in known]
-    if job.status not in UNFINISHED:
-        return unknown
-    # the running attempt may still write rows; earlier ones cannot
-    return [name for name in unknown if int(name.split("/")[1]) < job.lease_epoch]
+    return [name for name in names if name not in known and int(name.split("/")[1]) <= epoch]
 
 
 #: Rows per query, and number of files that are read concurrently.

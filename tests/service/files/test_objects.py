@@ -65,13 +65,12 @@ def test_final_file_is_copied_without_hard_links(tmp_path: Path, monkeypatch: py
         Artifacts(f"file://{tmp_path / 'results'}").put("job_1", 1, "stylized.ply", tmp_path / "none", final=True)
 
 
-def test_files_without_rows_are_swept(artifacts: Artifacts, tmp_path: Path) -> None:
+def test_objects_are_removed_by_name_and_by_folder(artifacts: Artifacts, tmp_path: Path) -> None:
     source = tmp_path / "plan.json"
     source.write_bytes(b"{}")
-    old, new, later = (artifacts.put("job_1", epoch, "plan.json", source) for epoch in (1, 2, 10))
+    old, new = (artifacts.put("job_1", epoch, "plan.json", source) for epoch in (1, 2))
     other = artifacts.put("job_2", 1, "plan.json", source)
-    artifacts.sweep("job_1", 2, {new.location})
-    assert b"".join(artifacts.objects.read(later.location, 0, 2)) == b"{}", "of a lease whose rows are still to come"
+    artifacts.objects.remove(old.location)
     assert b"".join(artifacts.objects.read(new.location, 0, 2)) == b"{}"
     with pytest.raises(FileNotFoundError):
         list(artifacts.objects.read(old.location, 0, 2))
@@ -266,12 +265,11 @@ def test_later_objects_are_visible_to_other_processes(
     """fsspec caches folder listings, but files that other processes have just added must be found."""
     source = write(tmp_path, 10)
     first = remote.put("job_1", 1, "plan.json", source)
-    remote.sweep("job_1", 9, {first.location})
+    assert list(remote.objects.below("job_1")) == [first.location]
     late = f"{environment['AWS_ENDPOINT_URL']}/results/{prefix}/job_1/2/x/late"
     assert httpx2.put(late, content=b"0123456789").status_code == 200
     assert b"".join(remote.objects.read("job_1/2/x/late", 0, 10)) == b"0123456789"
-    remote.sweep("job_1", 9, {first.location})
-    assert httpx2.head(late).status_code == 404
+    assert set(remote.objects.below("job_1")) == {first.location, "job_1/2/x/late"}
 
 
 def test_missing_bucket_is_an_outage_and_no_lost_file(environment: dict[str, str]) -> None:

@@ -14,12 +14,14 @@ import pytest
 from safetensors.numpy import save_file
 
 from service import problems
+from service.files.blobs import BlobFolder
 from service.files.objects import Artifacts
 from service.problems import NoSpaceError
 from service.scheduling import attempt_process
-from service.scheduling.attempt_files import Outbox, Publisher, sweep
+from service.scheduling.attempt_files import Outbox, Publisher
 from service.scheduling.attempt_process import report_failure, report_prepared, send
 from service.scheduling.attempts import progress_seconds
+from service.scheduling.housekeeping import clean_up
 from service.scheduling.messages import Ending, Report, StopRequest, attempt_ending, cause_of_error, failure, outage
 from service.settings import ServiceSettings
 from service.states import AttemptOutcome, Cause, Published
@@ -274,7 +276,7 @@ def test_live_colors_are_published_until_the_job_has_succeeded(
     assert stored_names(settings).count("colors.f16") == 1, "the older one is still there"
     (folder / "out" / "stylized.ply").write_bytes(b"ply")
     publisher.succeed({})
-    sweep(store, Artifacts(settings.artifacts_url), lease.job_id, lease.epoch)
+    clean_up(store, Artifacts(settings.artifacts_url), BlobFolder(settings.folder, store.inputs, 0))
     assert stored_names(settings) == ["log.txt", "stylized.ply"]
     assert [row.name for row in store.jobs.artifacts(lease.job_id)] == ["log.txt", "stylized.ply"]
 
@@ -311,13 +313,14 @@ def test_success_publishes_results_and_sweeps_leftovers(
     assert not publisher.has_result()
     for name in ("stylized.ply", "stylized.report.json", "stylized.loss.png", "stray.txt"):
         (folder / "out" / name).write_text(name)
-    Artifacts(settings.artifacts_url).put(lease.job_id, lease.epoch, "cut_off.jpg", folder / "log.txt")
+    for name, epoch in (("cut_off.jpg", lease.epoch), ("later.jpg", lease.epoch + 1)):
+        Artifacts(settings.artifacts_url).put(lease.job_id, epoch, name, folder / "log.txt")
     assert publisher.has_result()
     publisher.succeed({"steps": 1})
-    sweep(store, Artifacts(settings.artifacts_url), lease.job_id, lease.epoch)
+    clean_up(store, Artifacts(settings.artifacts_url), BlobFolder(settings.folder, store.inputs, 0))
     job = store.jobs.get(lease.job_id, None)
     assert (job.status, job.result) == ("succeeded", {"steps": 1})
     names = ["log.txt", "loss.png", "report.json", "stylized.ply"]
     assert [row.name for row in store.jobs.artifacts(lease.job_id)] == names
-    assert stored_names(settings) == names
+    assert stored_names(settings) == ["later.jpg", *names], "the row of a derived file may be still to come"
     assert store.jobs.unswept(10) == []
