@@ -318,6 +318,22 @@ _PARTIAL_SECONDS = 6 * 3600.0
 Fetch = Callable[[Path], None]
 
 
+def _fetch_intact(fetch: Fetch, target: Path, sha256: str) -> None:
+    """Copy an object of the store to a file, and verify its SHA-256.
+
+    Raises:
+        LostFileError: If there is no such object.
+        DamagedFileError: If the SHA-256 differs.
+    """
+    try:
+        fetch(target)
+    except FileNotFoundError as error:
+        raise problems.FILE_LOST(sha256=sha256) from error
+    if (digest := file_digest(target)) != sha256:
+        _log.error("file damaged in the store: sha256=%s received=%s", sha256, digest)
+        raise problems.FILE_DAMAGED(sha256=sha256)
+
+
 class FileCache:
     """Cache of stored files on one host, verified by their SHA-256 and limited in total size.
 
@@ -389,14 +405,9 @@ class FileCache:
         self.evict(size)
         partial = self._partial / secrets.token_hex(8)
         try:
-            fetch(partial)
-            if (digest := file_digest(partial)) != sha256:
-                _log.error("file damaged in the store: sha256=%s received=%s", sha256, digest)
-                raise problems.FILE_DAMAGED(sha256=sha256)
+            _fetch_intact(fetch, partial, sha256)
             os.link(partial, target)  # link first: a file without other links could be evicted
             self._add(partial, sha256)
-        except FileNotFoundError as error:
-            raise problems.FILE_LOST(sha256=sha256) from error
         finally:
             partial.unlink(missing_ok=True)
 
@@ -505,15 +516,8 @@ class Artifacts:
             LostFileError: If the file store does not have the result.
             DamagedFileError: If the received file has a different SHA-256.
         """
-        try:
-            with atomic_path(target) as temporary:
-                self.objects.get(location, temporary)
-                digest = file_digest(temporary)
-                if digest != sha256:
-                    _log.error("file damaged: name=%s sha256=%s expected=%s", location, digest, sha256)
-                    raise problems.FILE_DAMAGED(sha256=sha256)
-        except FileNotFoundError as error:
-            raise problems.FILE_LOST(sha256=sha256) from error
+        with atomic_path(target) as temporary:
+            _fetch_intact(partial(self.objects.get, location), temporary, sha256)
 
 
 def media_type(name: str) -> str:
