@@ -21,7 +21,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.files.advice import advice_for_name
 from sgsst_core.files.formats import format_of_name
 from sgsst_core.settings import Option, checked
-from worker.job import JobSpec, SceneRequest
+from worker.job import JobSpec, SceneRequest, scene_bytes
 from worker.options import (
     GROUPS,
     MOST_PAINTED,
@@ -212,6 +212,11 @@ def default_job_name(inputs: Sequence[Mapping[str, Any]], regions: Sequence[Regi
     format = format_of_name(scene)
     plain = scene[: -len(format.suffix)] if format else PurePosixPath(scene).stem
     return f"{plain} · {' + '.join(styles)}"[:MAX_JOB_NAME]
+
+
+def scene_size(inputs: Sequence[Mapping[str, Any]]) -> int:
+    """Return the size of a job's scene in bytes, once it is read."""
+    return sum(scene_bytes(entry["name"], entry["size"]) for entry in inputs if entry["role"] == "scene")
 
 
 def region_styles(regions: Sequence[RegionRequest]) -> list[str]:

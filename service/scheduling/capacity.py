@@ -23,14 +23,14 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.inputs import JobParameters, stored_parameters
+from service.inputs import JobParameters, scene_size, stored_parameters
 from service.settings import ServiceSettings
 from service.store.tables import JobRow
 from sgsst_core import container
 from sgsst_core.errors import SettingsError
 from sgsst_core.scales import ScaleWeights, scale_count
 from sgsst_core.settings import Settings, make_settings
-from worker.job import GAUSSIAN_BYTES, memory_beside_gpus, scene_bytes
+from worker.job import GAUSSIAN_BYTES, memory_beside_gpus
 from worker.processes import ProcessId, home
 
 
@@ -168,7 +168,7 @@ class Capacity:
         if slots < 1:
             return None
         parameters, settings = _stored_settings(job)
-        scene = _scene_bytes(job, settings)
+        scene = int(scene_size(job.inputs) * settings.growth)  # once it is refined
         if self._machine.gpus:
             seconds = _seconds_of_steps(job, parameters, settings, scene)
             return self._on_gpus(parameters.workers, seconds, scene, held, min(max(waiting, 1), slots))
@@ -233,10 +233,3 @@ def _stored_settings(job: JobRow) -> tuple[JobParameters, Settings]:
         return parameters, parameters.settings()
     except SettingsError:
         return JobParameters(), make_settings()
-
-
-def _scene_bytes(job: JobRow, settings: Settings) -> int:
-    """Return the size of a job's scene in bytes, once it is read and refined."""
-    files = [entry for entry in job.inputs if entry["role"] == "scene"]
-    size = sum(scene_bytes(str(entry.get("name", "")), entry["size"]) for entry in files)
-    return int(size * settings.growth)

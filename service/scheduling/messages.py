@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from service.inputs import CHECKPOINT
+from service.inputs import CHECKPOINT, scene_size
 from service.problems import DatabaseUnavailableError, NoSpaceError, StoreError
 from service.states import AttemptOutcome, Cause, Published
 from sgsst_core.errors import (
@@ -26,7 +26,7 @@ from sgsst_core.errors import (
     is_out_of_memory,
 )
 from sgsst_core.progress import Progress
-from worker.job import JobSpec, Result, scene_bytes
+from worker.job import JobSpec, Result
 from worker.run import Stored
 
 if TYPE_CHECKING:
@@ -56,8 +56,7 @@ class StoreWorkplace:
     @property
     def scene_bytes(self) -> int:
         """Size of the scene in bytes, once it is read."""
-        files = [entry for entry in self.inputs if entry["role"] == "scene"]
-        return sum(scene_bytes(entry["name"], entry["size"]) for entry in files)
+        return scene_size(self.inputs)
 
     def open(self, rank: int, stored: Stored) -> RankFolder:
         """Stage the job's files for a rank.

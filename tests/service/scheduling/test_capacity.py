@@ -181,7 +181,7 @@ def granted(capacity: Capacity, wanted: JobRow, held: Sequence[Grant] = (), wait
 
 
 def job(scene: int, **parameters: Any) -> JobRow:
-    inputs = [{"role": "scene", "size": scene}, {"role": "style", "size": 10**12}]
+    inputs = [{"role": "scene", "name": "s.ply", "size": scene}, {"role": "style", "size": 10**12}]
     return JobRow(id="job", parameters=parameters, inputs=inputs)
 
 
