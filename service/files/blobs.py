@@ -410,6 +410,7 @@ class StoredBlobs(Blobs):
             self._cache.evict(max(size, 1) + self._min_free)
             super().ensure_space(size)
 
+    @disk_errors()
     def add(self, path: Path, upload_id: str | None = None) -> str:
         """Upload a received file, and move it into the cache.
 
@@ -444,6 +445,7 @@ class StoredBlobs(Blobs):
         """Return a writer that stores one object per `save`, so that any API process can continue the upload."""
         return _ObjectWriter(self.incoming, self.objects, self._inputs, upload, seconds)
 
+    @disk_errors()
     def _finish_upload(self, upload: UploadRow, seconds: float) -> str:
         parts = self._inputs.parts(upload.id)
         if sum(part.size for part in parts) != upload.length:
@@ -470,6 +472,7 @@ class StoredBlobs(Blobs):
 class _ObjectWriter(PartWriter):
     """Writer of an upload's bytes: a file on this host buffers them until they are saved to the store."""
 
+    @disk_errors()
     def __init__(
         self, folder: Path, objects: ObjectStore, inputs: InputRows, upload: UploadRow, seconds: float
     ) -> None:

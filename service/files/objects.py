@@ -70,7 +70,8 @@ def disk_errors() -> Iterator[None]:
         yield
     except (OSError, OutputError) as error:
         cause = error.__cause__ if isinstance(error, OutputError) else error
-        if not isinstance(cause, OSError) or cause.errno in (errno.ENOENT, errno.EMFILE, errno.ENFILE):
+        no_files = (errno.EMFILE, errno.ENFILE)
+        if not isinstance(cause, OSError) or isinstance(cause, FileNotFoundError) or cause.errno in no_files:
             raise
         problem = problems.NO_SPACE if cause.errno in DISK_FULL else problems.STORE_UNAVAILABLE
         raise problem(f"The service cannot write the file: {cause.strerror}.") from error

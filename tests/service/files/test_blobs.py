@@ -412,9 +412,12 @@ def test_missing_write_permission_is_a_failure_of_the_store(tmp_path: Path) -> N
         row = inputs.create_upload("me", 5, "scene.ply", "", 3600)
         received = blobs.receive(10)
         received.close()
+        settings = ServiceSettings(data=blobs.incoming.parent, min_free_bytes=0)
+        stored = StoredBlobs(settings, inputs, ObjectStore("memory://inputs"))
         with unprivileged():
             for write in (
                 lambda: blobs.append(row, 3600),
+                lambda: stored.append(row, 3600),
                 lambda: blobs.receive(10),
                 lambda: blobs.add(received.path),
             ):
