@@ -58,6 +58,9 @@ class ChildProcess:
 
     Args:
         cluster: Whether the attempt runs on a Ray cluster, which assigns GPUs itself.
+
+    Attributes:
+        reports: Reports of the process, then None once it has closed its output.
     """
 
     def __init__(self, folder: Path, grant: Grant, *, cluster: bool) -> None:
@@ -74,7 +77,7 @@ class ChildProcess:
                 env=environment,
                 start_new_session=True,
             )
-        self._reports: queue.Queue[Report | None] = queue.Queue()
+        self.reports: queue.Queue[Report | None] = queue.Queue()
         self._deadline: float | None = None
         self._finishing = False
         threading.Thread(target=self._listen, name=f"{folder.name}-out", daemon=True).start()
@@ -83,16 +86,8 @@ class ChildProcess:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             with contextlib.suppress(ValueError):
-                self._reports.put(Report.model_validate_json(line))
-        self._reports.put(None)
-
-    def receive(self, seconds: float) -> Report | None:
-        """Return the next report; None if the process has closed its output.
-
-        Raises:
-            queue.Empty: If no report arrives within this time.
-        """
-        return self._reports.get(timeout=seconds)
+                self.reports.put(Report.model_validate_json(line))
+        self.reports.put(None)
 
     def finish(self) -> None:
         """Ask the process to end its job after the current step, with the present colors as the result.
@@ -341,11 +336,11 @@ class RunningAttempt:
         ended = False
         while not ended:
             with contextlib.suppress(queue.Empty):
-                report = process.receive(_REPORT_SECONDS)
+                report = process.reports.get(timeout=_REPORT_SECONDS)
                 while report is not None:
                     ending = report.ending or ending
                     self._handle(report)
-                    report = process.receive(0.0)
+                    report = process.reports.get_nowait()
                 ended = True
             if self._stop_request == StopRequest.ABANDON:
                 process.kill()
