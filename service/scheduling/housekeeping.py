@@ -27,8 +27,8 @@ from service.store import Store
 from service.store.files import BLOBS, UPLOADS
 from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, UploadRow
 
-#: Maximum number of jobs whose leftover files are looked for at a time.
-_MAX_SWEEPS = 20
+#: Maximum number of jobs whose leftover files are looked for in one round.
+_MAX_SWEEPS = 1000
 #: Description of a file.
 What = Literal["input", "result", "checkpoint", "upload"]
 
@@ -37,11 +37,10 @@ def clean_up(store: Store, artifacts: Artifacts, blobs: Blobs) -> None:
     """Delete what has expired, and leftovers of attempts at ended jobs."""
     for job_id in store.jobs.expire():
         artifacts.objects.remove_below(job_id)
-    while ended := store.jobs.unswept(_MAX_SWEEPS):
-        for job_id, epoch in ended:
-            for name in _strays(store, job_id, artifacts.objects.below(job_id), epoch):
-                artifacts.objects.remove(name)
-            store.jobs.mark_swept(job_id, epoch)
+    for job_id, epoch in store.jobs.unswept(_MAX_SWEEPS):
+        for name in _strays(store, job_id, artifacts.objects.below(job_id), epoch):
+            artifacts.objects.remove(name)
+        store.jobs.mark_swept(job_id, epoch)
     blobs.collect()
 
 
