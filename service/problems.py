@@ -36,14 +36,6 @@ class NotFoundError(ServiceError):
     """Object that does not exist or belongs to another owner."""
 
 
-class NoJobError(NotFoundError):
-    """Job that does not exist or belongs to another owner."""
-
-
-class NoShareError(NotFoundError):
-    """Share that does not exist, has expired or was revoked."""
-
-
 class ConflictError(ServiceError):
     """Operation that the state of the job or upload does not allow."""
 
@@ -213,7 +205,7 @@ IDEMPOTENCY_KEY_REUSED = ProblemType(
 
 NOT_FOUND = _missing()
 FILE_REMOVED = _missing("The file has just been removed.")
-NO_JOB = ProblemType("not-found", 404, "There is no job {job_id}.", error=NoJobError, example={"job_id": JOB_ID})
+NO_JOB = _missing("There is no job {job_id}.", example={"job_id": JOB_ID})
 NO_ARTIFACT = _missing(
     "Job {job_id} has no file {name!r}, or not yet. Its list of artifacts has all files.",
     example={"job_id": JOB_ID, "name": "stylized.ply"},
@@ -224,7 +216,7 @@ NO_INPUT = _missing(
 )
 NO_UPLOAD = _missing("There is no upload {upload_id}, or it has expired.", example={"upload_id": UPLOAD_ID})
 LOST_UPLOAD = _missing("The bytes of upload {upload_id} are gone. Start a new one.", example={"upload_id": UPLOAD_ID})
-NO_SHARE = ProblemType("not-found", 404, "This link does not work: it has expired or was revoked.", error=NoShareError)
+NO_SHARE = _missing("This link does not work: it has expired or was revoked.")
 NO_SHARED_FILE = ProblemType(
     "no-shared-file", 404, "This result has no file {name!r}.", error=NotFoundError, example={"name": "colors.f16"}
 )

@@ -34,7 +34,7 @@ from api.http.sending import PAGE_HEADERS, ConditionsDep, SentFile, file_answers
 from service import problems
 from service.files.objects import media_type
 from service.inspection.derived import POSTER
-from service.problems import SHARE_ID, SHARE_TOKEN, NoJobError, NoShareError, ServiceError
+from service.problems import SHARE_ID, SHARE_TOKEN, NotFoundError, ServiceError
 from service.store.jobs import Shared
 from service.store.keys import Quotas
 from service.store.tables import ArtifactRow
@@ -163,14 +163,14 @@ async def get_shared(request: Request, context: ContextDep, token: ShareToken) -
     Raises:
         FOREIGN_SITE: If the service requires no keys, and the request does not come from this machine's pages.
         RATE_LIMITED: If requests of one share, or with wrong tokens from one address, arrive too fast.
-        NoShareError: If the token is not valid.
+        NO_SHARE: If the token is not valid.
     """
     if not context.settings.keys_required:
         check_site(request, context.settings)
     limit = Quotas.of_settings(context.settings).requests_a_second
     try:
         shared = await asyncio.to_thread(context.store.shares.find, token)
-    except NoShareError:
+    except NotFoundError:
         context.rates.take(f"address {request.client.host if request.client else ''}", limit)
         raise
     context.rates.take(shared.share.id, limit)
@@ -254,14 +254,14 @@ def _shared_view(context: Context, shared: Shared) -> tuple[SharedView, Artifact
     """Return the public view of a shared job, only what the page needs to show it, and the row of the job's plan.
 
     Raises:
-        NoShareError: If the job was deleted meanwhile.
+        NO_SHARE: If the job was deleted meanwhile.
     """
     jobs, job_id = context.store.jobs, shared.job.id
     try:
         job, _ = jobs.detail(job_id, None)
         files = [name for name in _RESULTS if _result(context, job_id, name)]
         plan = jobs.artifact(job_id, "plan.json")
-    except NoJobError:
+    except NotFoundError:
         raise problems.NO_SHARE() from None
     view = SharedView(
         name=job.row.name,

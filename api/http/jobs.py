@@ -320,7 +320,7 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 
 def _check_id(job_id: str) -> str:
-    """Return the id of a job; raise NoJobError if a text cannot be one, which needs no query."""
+    """Return the id of a job; raise NO_JOB if a text cannot be one, which needs no query."""
     if not is_id(job_id):
         raise problems.NO_JOB(job_id=job_id[:60])
     return job_id
@@ -469,7 +469,7 @@ def find(context: Context, caller: Caller, job_id: str) -> JobRow:
     """Return the caller's job with this id.
 
     Raises:
-        NoJobError: If there is no such job, or it belongs to another caller.
+        NO_JOB: If there is no such job, or it belongs to another caller.
     """
     return context.store.jobs.get(job_id, caller.owner)
 

@@ -45,7 +45,7 @@ from service import problems
 from service.deadlines import suspended
 from service.inputs import MOST_STYLES, RESULT, JobParameters, check_roles, default_job_name, staged_name
 from service.inspection.inspector import Show
-from service.problems import UPLOAD_ID, NoJobError, ServiceError, StoreError
+from service.problems import UPLOAD_ID, NotFoundError, ServiceError, StoreError
 from service.scheduling.webhooks import check_url
 from service.settings import check_weights
 from service.states import JobStatus, WebhookEvent
@@ -783,7 +783,7 @@ def _referred_results(context: Context, caller: Caller, received: Received) -> d
     for _, role, text in received.uploads:
         if reference := _RESULT_PATH.fullmatch(text.removeprefix(subpath.get())):
             row = None
-            with suppress(NoJobError):
+            with suppress(NotFoundError):
                 row = context.store.jobs.artifact(find(context, caller, reference[1]).id, RESULT)
             if row is None:
                 raise problems.UNKNOWN_INPUT(job_id=reference[1], name=RESULT, input=role)
@@ -810,7 +810,7 @@ def _referred_input(
     Raises:
         UNKNOWN_INPUT: If the input does not exist, or was released.
     """
-    with suppress(NoJobError):
+    with suppress(NotFoundError):
         if job_id not in released:
             released[job_id] = find(context, caller, job_id).status == JobStatus.EXPIRED
         place = parse_input(name)

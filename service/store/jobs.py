@@ -85,7 +85,7 @@ def job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool
         lock: Whether to lock the row. Whoever adds rows that refer to the job does so first; it is then not deleted.
 
     Raises:
-        NoJobError: If there is no such job or it belongs to another owner.
+        NO_JOB: If there is no such job or it belongs to another owner.
     """
     job = session.get(JobRow, job_id, with_for_update=lock, populate_existing=lock)
     if job is None or (owner is not None and job.owner != owner):
@@ -354,7 +354,7 @@ class Jobs:
         retention: Time in seconds until the results of an ended job expire.
 
     Raises:
-        NoJobError: If a method gets a job that does not exist or belongs to another owner.
+        NO_JOB: If a method gets a job that does not exist or belongs to another owner.
     """
 
     def __init__(self, database: Database, retention: float) -> None:
@@ -734,7 +734,7 @@ class ShareLinks:
             seconds: Lifetime of the share.
 
         Raises:
-            NoJobError: If there is no such job or it belongs to another owner.
+            NO_JOB: If there is no such job or it belongs to another owner.
             NO_RESULT: If the job has no result.
             TOO_MANY_SHARES: If the job has `MOST_SHARES` shares.
         """
@@ -765,7 +765,7 @@ class ShareLinks:
         """Delete a share, so that its link no longer works.
 
         Raises:
-            NoShareError: If the job has no such share.
+            NO_SHARE: If the job has no such share.
         """
         with self._database.writing() as session:
             deleted = session.execute(delete(ShareRow).where(ShareRow.id == share_id, ShareRow.job_id == job_id))
@@ -776,7 +776,7 @@ class ShareLinks:
         """Return the share with this token, and its job.
 
         Raises:
-            NoShareError: If there is none, it has expired or was revoked, its job has no result any more, or the key of
+            NO_SHARE: If there is none, it has expired or was revoked, its job has no result any more, or the key of
                 its owner was revoked.
         """
         match = _TOKEN.fullmatch(token)
