@@ -142,10 +142,6 @@ ACTIONS: Mapping[Transition, Action] = {
 }
 
 
-class TransitionError(Exception):
-    """Transition that a job's status does not allow."""
-
-
 def allowed(status: str, transition: Transition) -> bool:
     """Return whether a status allows a transition."""
     return status in TRANSITIONS[transition]
@@ -155,9 +151,6 @@ def next_status(status: str, transition: Transition) -> JobStatus:
     """Return the status that a transition leads to.
 
     Raises:
-        TransitionError: If the status does not allow the transition.
+        KeyError: If the status does not allow the transition.
     """
-    target = TRANSITIONS[transition].get(JobStatus(status))
-    if target is None:
-        raise TransitionError(f"There is no {transition} for a job with status {status}.")
-    return target
+    return TRANSITIONS[transition][JobStatus(status)]

@@ -97,7 +97,7 @@ def move(session: Session, job: JobRow, transition: Transition, now: float) -> N
     """Change a job's status and add an event for clients that watch the job.
 
     Raises:
-        TransitionError: If the job's status does not allow the transition.
+        KeyError: If the job's status does not allow the transition.
     """
     job.status = next_status(job.status, transition)
     add_status_event(session, job, now)
