@@ -607,21 +607,19 @@ class Jobs:
         Raises:
             QUOTA_EXCEEDED: If the files exceed the owner's quota of stored bytes; none is published.
         """
-        unused = []
+        now, replaced = self._database.clock(), []
         with self._database.writing() as session:
             lock_owner(session, owner)
             session.get(JobRow, source.job_id, with_for_update=True)  # before its files, as everybody else
             row = session.get(ArtifactRow, (source.job_id, source.name))
+            if row is None or row.location != source.location:
+                return [file.location for file in files]
             for file in files:
-                if row is None or row.location != source.location:
-                    unused.append(file.location)
-                    continue
-                now = self._database.clock()
-                unused += put_artifact(session, source.job_id, file, now)
+                replaced += put_artifact(session, source.job_id, file, now)
                 add_usage(session, owner, now, bytes=file.size)
             session.flush()
             check_bytes(session, owner, quotas)
-        return unused
+        return replaced
 
     def loss_history(self, job: JobRow, most: int) -> list[dict[str, Any]]:
         """Return a job's loss history: its points, and its current progress as the last one, as in `add_point`.
