@@ -258,7 +258,6 @@ class BlobFolder(Blobs):
         if intact:
             final.unlink()  # an intact file stays: a confined process may open only the file that it was given
         else:
-            known.parent.mkdir(exist_ok=True)
             final.replace(known)
             flush_folder(known.parent)
         return sha256
