@@ -409,9 +409,10 @@ async def change_job(
 
 
 def _rename(context: Context, caller: Caller, job_id: str, name: str) -> None:
-    job, _ = context.store.jobs.detail(job_id, caller.owner)
-    regions = JobParameters(**job.row.parameters).region_requests
-    context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs, regions))
+    if not name:
+        job, _ = context.store.jobs.detail(job_id, caller.owner)
+        name = default_job_name(job.inputs, JobParameters(**job.row.parameters).region_requests)
+    context.store.jobs.rename(job_id, caller.owner, name)
 
 
 @router.get("/{job_id}/progress", response_model=ProgressHistory)

@@ -226,7 +226,7 @@ def test_unusable_masks_are_refused(
 def test_stored_jobs_are_shown_as_they_were_stored(
     store: Store, client: httpx2.Client, files: dict[str, bytes]
 ) -> None:
-    """Parameter names that this version lacks are shown as stored. Only a retry of such a job is refused."""
+    """Parameter names that this version lacks are shown as stored. Such a job can be renamed, but not retried."""
     created = client.post("/v1/jobs", files=form(files)).json()
     stored_parameters = {"preset": "preview", "sharpness": 3, "steps_sos": -5, "workers": "many"}
     job, _ = store.jobs.create(NewJob("local", "old", 0, stored_parameters, created["inputs"]), limit=1000)
@@ -234,6 +234,7 @@ def test_stored_jobs_are_shown_as_they_were_stored(
     answer = client.get(f"/v1/jobs/{job.id}")
     assert answer.status_code == 200
     assert listed["parameters"] == answer.json()["parameters"] == created["parameters"] | stored_parameters
+    assert client.patch(f"/v1/jobs/{job.id}", json={"name": "older"}).json()["name"] == "older"
     assert client.post(f"/v1/jobs/{job.id}/cancel").json()["status"] == "canceled"
     problem = refused(client.post(f"/v1/jobs/{job.id}/retry"), 422, "invalid-settings")
     assert "stored by an earlier version" in problem["detail"]
