@@ -37,7 +37,9 @@ from api.client.transport import (
     RequestError,
     Transport,
     checked,
+    has_events,
     in_thread,
+    is_temporary,
     json_text,
 )
 from service.states import Transition
@@ -138,7 +140,7 @@ class AsyncClient:
         given = {"webhook": webhook, "webhook_events": ",".join(webhook_events)}
         fields += [(name, (None, value)) for name, value in given.items() if value]
         headers = {"Idempotency-Key": secrets.token_hex(16)}
-        return Job.of((await self._transport.call("POST", "/v1/jobs", files=fields, headers=headers)).json())
+        return Job.of(await self._transport.json("POST", "/v1/jobs", files=fields, headers=headers))
 
     async def plan(
         self,
@@ -198,7 +200,7 @@ class AsyncClient:
 
     async def job(self, job_id: str) -> Job:
         """Return the current state of a job."""
-        return Job.of((await self._transport.call("GET", _job_path(job_id))).json())
+        return Job.of(await self._transport.json("GET", _job_path(job_id)))
 
     async def jobs(self, *, status: Sequence[str] = (), limit: int | None = None) -> AsyncIterator[Job]:
         """Yield the jobs of this key, newest first."""
@@ -206,7 +208,7 @@ class AsyncClient:
         params: dict[str, Any] = {"status": list(status)}
         while left is None or left > 0:
             params["limit"] = min(left or _PAGE, _PAGE)
-            page = (await self._transport.call("GET", "/v1/jobs", params=params)).json()
+            page = await self._transport.json("GET", "/v1/jobs", params=params)
             for data in page["jobs"]:
                 yield Job.of(data)
             params["cursor"] = page["next_cursor"]
@@ -224,7 +226,7 @@ class AsyncClient:
             try:
                 async with self._transport.http.sse(path, headers=headers, timeout=timeout) as source:
                     self._transport.reached = True
-                    if source.response.status_code != httpx2.codes.OK:  # 204: no events will follow
+                    if not has_events(source.response):  # 204: no events will follow
                         await source.response.aread()
                         checked(source.response)
                         return
@@ -233,11 +235,11 @@ class AsyncClient:
                             event = Event(int(sent.id or 0), sent.event, json.loads(sent.data))
                             after, failures = event.id, 0
                             yield event
-            except httpx2.TransportError as error:
+            except (httpx2.RequestError, ApiError) as error:
                 # stamina cannot do this: each event resets the count of failures
                 failures += 1
-                if failures >= TRIES or self._transport.gives_up(error):
-                    raise self._transport.unreachable(error) from None
+                if failures >= TRIES or not is_temporary(error) or self._transport.gives_up(error):
+                    raise (error if isinstance(error, ApiError) else self._transport.unreachable(error)) from None
                 await anyio.sleep(FIRST_WAIT * 2.0 ** (failures - 1))
                 continue
             if (await self.job(job_id)).finished:
@@ -255,7 +257,7 @@ class AsyncClient:
         cursor: str | None = ""
         while cursor is not None:
             query = f"?cursor={quote(cursor, safe='')}" if cursor else ""
-            page = (await self._transport.call("GET", f"{_job_path(job_id)}/artifacts{query}")).json()
+            page = await self._transport.json("GET", f"{_job_path(job_id)}/artifacts{query}")
             artifacts += page["artifacts"]
             cursor = page.get("next_cursor")  # services of earlier versions send all at once
         return artifacts
@@ -305,7 +307,7 @@ class AsyncClient:
         """
         parts = [{"job_id": other, "weight": each} for other, each in (others or {}).items()]
         body = {"weight": weight, "others": parts, "format": format}
-        return str((await self._transport.call("POST", f"{_job_path(job_id)}/blends", json=body)).json()["name"])
+        return str((await self._transport.json("POST", f"{_job_path(job_id)}/blends", json=body))["name"])
 
     async def video(self, /, job_id: str, progress: Progress = no_progress, **options: Any) -> str:
         """Render a video of a finished job's result, and return its name for `download`. It takes minutes.
@@ -329,11 +331,11 @@ class AsyncClient:
             until: Last day; None for today.
         """
         days = {name: day for name, day in (("since", since), ("until", until)) if day is not None}
-        return list((await self._transport.call("GET", "/v1/usage", params=days)).json()["usage"])
+        return list((await self._transport.json("GET", "/v1/usage", params=days))["usage"])
 
     async def act(self, job_id: str, action: str) -> Job:
         """Request an action on a job by its name in `service.states.ACTIONS`."""
-        return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/{action}")).json())
+        return Job.of(await self._transport.json("POST", f"{_job_path(job_id)}/{action}"))
 
     async def finish(self, job_id: str) -> Job:
         """End a running job after its current step, and keep its result so far."""
@@ -355,8 +357,7 @@ class AsyncClient:
             poster: Whether sites where the link is posted can show an image of the result.
         """
         body = {"days": days, "poster": poster}
-        response = await self._transport.call("POST", f"{_job_path(job_id)}/shares", json=body)
-        share: dict[str, Any] = response.json()
+        share: dict[str, Any] = await self._transport.json("POST", f"{_job_path(job_id)}/shares", json=body)
         for name in ("url", "embed_url"):
             if share.get(name):
                 share[name] = f"{self.url}/shared{share[name].rpartition('/shared')[2]}"
@@ -481,7 +482,7 @@ async def _upload(transport: Transport, path: Path, name: str, progress: Progres
         "Upload-Metadata": f"filename {base64.b64encode(name.encode()).decode()}",
         "Idempotency-Key": secrets.token_hex(16),
     }
-    created = (await transport.call("POST", "/v1/uploads", headers=creation)).json()
+    created = await transport.json("POST", "/v1/uploads", headers=creation)
     where = f"/v1/uploads/{created['id']}"
     offset = int(created["offset"])
     while offset < size:

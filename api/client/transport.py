@@ -90,6 +90,14 @@ class Transport:
 
         return await self._retry(once, reading=method in _READS)
 
+    async def json(self, method: str, path: str, **options: Any) -> Any:
+        """Send a request, and return the JSON of its response.
+
+        Raises:
+            RequestError, ApiError: As for `call`, or if the response is not JSON.
+        """
+        return parsed(await self.call(method, path, **options))
+
     async def work(self, path: str, step: str, progress: Progress, **options: Any) -> dict[str, Any]:
         """Request some work, and return its result.
 
@@ -106,9 +114,9 @@ class Transport:
         async def once() -> None:
             async with self.http.sse(path, method="POST", **options) as source:
                 self.reached = True
-                if not source.response.headers.get("content-type", "").startswith("text/event-stream"):
+                if not has_events(source.response):
                     await source.response.aread()
-                    result.update(checked(source.response).json())
+                    result.update(parsed(checked(source.response)))
                     return
                 async for event in source:
                     data = json.loads(event.data or "{}")  # messages without data only keep the connection alive
@@ -175,7 +183,7 @@ class Transport:
 
         try:
             return await self._retrying(may_pass, once)
-        except httpx2.TransportError as error:
+        except httpx2.RequestError as error:
             raise self.unreachable(error) from None
 
 
@@ -348,6 +356,23 @@ def checked(response: httpx2.Response) -> httpx2.Response:
     raise refusal(message, response.status_code, problem)
 
 
+def has_events(response: httpx2.Response) -> bool:
+    """Return whether a response is a stream of events."""
+    return bool(response.headers.get("content-type", "").startswith("text/event-stream"))
+
+
+def parsed(response: httpx2.Response) -> Any:
+    """Return the JSON of a response.
+
+    Raises:
+        ApiError: If the response is not JSON.
+    """
+    try:
+        return response.json()
+    except ValueError as error:
+        raise _foreign(response, "it sends no JSON") from error
+
+
 def _check_origin(response: httpx2.Response) -> None:
     """Raise an ApiError if a successful response is not the service's, whose responses are JSON or empty."""
     kind = response.headers.get("content-type", "no type")
@@ -357,8 +382,13 @@ def _check_origin(response: httpx2.Response) -> None:
         what = f"it sends {kind}"
     else:
         return
+    raise _foreign(response, what)
+
+
+def _foreign(response: httpx2.Response, what: str) -> ApiError:
+    """Return the error for a response that another program has sent."""
     url = response.request.url
-    raise ApiError(f"{url} does not answer like the service: {what}. Check the address.", response.status_code)
+    return ApiError(f"{url} does not answer like the service: {what}. Check the address.", response.status_code)
 
 
 def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
@@ -368,4 +398,4 @@ def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
 
 def is_temporary(error: Exception) -> bool:
     """Return whether the same request may succeed later: there was no response, or it reports a temporary failure."""
-    return isinstance(error, httpx2.TransportError) or (isinstance(error, ApiError) and error.status in _TEMPORARY)
+    return isinstance(error, httpx2.RequestError) or (isinstance(error, ApiError) and error.status in _TEMPORARY)

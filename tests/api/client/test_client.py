@@ -426,6 +426,26 @@ def test_events_resume_after_lost_connection(connect: Any, service: Service, pat
 
 
 @both
+def test_events_resume_after_errors_of_a_proxy(connect: Any) -> None:
+    """A reverse proxy answers in place of a service that is being restarted."""
+    errors = [502, 503]
+
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        if not handler.path.endswith("/events"):
+            job = json.dumps({"id": "job_1", "status": "succeeded"})
+            send(handler, job.encode(), Content_Type="application/json")
+        elif errors:
+            send(handler, b"<html>", errors.pop(), Content_Type="text/html")
+        else:
+            event = b'id: 7\nevent: status\ndata: {"status": "succeeded"}\n\n'
+            send(handler, event, Content_Type="text/event-stream")
+
+    with LocalServer(answer) as server, connect(server.origin) as client:
+        assert [event.id for event in client.watch("job_1")] == [7]
+    assert errors == []
+
+
+@both
 def test_upload_resumes_after_lost_connection(
     connect: Any, service: Service, paths: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
