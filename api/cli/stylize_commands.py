@@ -447,7 +447,7 @@ def _make_by_service(
 def _submitted(client: Client, job_id: str, name: str, request: JobSpec, options: StylizeOptions) -> str:
     """Return the id of the job that makes a result: that of an earlier run if it can still succeed, or a new one."""
     try:
-        if job_id and client.job(job_id).status not in ("failed", "canceled"):
+        if job_id and client.job(job_id).status not in ("failed", "canceled", "expired"):
             return job_id
     except SgsstError as error:  # deleted
         if getattr(error, "status", 0) != 404:

@@ -17,6 +17,8 @@ from PIL import Image
 from api.cli.main import main
 from api.client import Client
 from api.client.transport import RequestError
+from service.states import JobStatus
+from service.store.tables import JobRow
 from tests.api.conftest import Sgsst
 from tests.api.service import ROOT, Service
 from tests.full_disk import full_disk
@@ -116,16 +118,24 @@ def test_interrupted_batch_waits_for_its_jobs_again(
     out = tmp_path / "results"
     arguments = ["batch", *files, "--out", str(out), "--workers", "2", "--url", service.url]
     command = [sys.executable, "-m", "api.cli", *arguments]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, env=service.environment, cwd=ROOT, text=True) as process:
-        assert process.stderr is not None
-        assert "queued" in process.stderr.readline()  # the job is followed
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 130
-    record = json.loads((out / "batch.json").read_text())
-    assert record["scene_style"]["complete"] is False
-    job = httpx2.get(f"{service.url}/v1/jobs/{record['scene_style']['job']}").json()
-    assert job["parameters"]["workers"] == 2
-    service.finish(record["scene_style"]["job"], {"stylized.ply": Path(files[0]).read_bytes()})
+
+    def interrupted_job() -> str:
+        with subprocess.Popen(command, stderr=subprocess.PIPE, env=service.environment, cwd=ROOT, text=True) as process:
+            assert process.stderr is not None
+            assert "queued" in process.stderr.readline()  # the job is followed
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 130
+        entry = json.loads((out / "batch.json").read_text())["scene_style"]
+        assert entry["complete"] is False
+        return str(entry["job"])
+
+    expired = interrupted_job()
+    with service.store() as store, store.database.writing() as session:
+        session.get_one(JobRow, expired).status = JobStatus.EXPIRED
+    job_id = interrupted_job()
+    assert job_id != expired, "its result is gone"
+    assert httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["parameters"]["workers"] == 2
+    service.finish(job_id, {"stylized.ply": Path(files[0]).read_bytes()})
     sgsst(arguments)
     assert (out / "scene_style.ply").read_bytes() == Path(files[0]).read_bytes()
     assert Image.open(out / "batch.jpg").width > 100
@@ -326,17 +336,23 @@ def test_escape_sequences_of_a_service_are_not_printed(
 
 
 def answer_as_a_stranger(handler: BaseHTTPRequestHandler) -> None:
-    """Send a page, as another program at the address of the service, or redirect `/moved`."""
+    """Send a page, as another program at the address of the service, redirect `/moved`, or send nothing."""
     if handler.path.startswith("/moved"):
         send(handler, status=301, Location="https://new.example/")
+    elif handler.path.startswith("/empty"):
+        send(handler)
     else:
         send(handler, b"<html>", Content_Type="text/html")
 
 
 def test_address_of_another_program_is_reported(sgsst: Sgsst) -> None:
     with LocalServer(answer_as_a_stranger) as server:
-        for path, what in (("", "it sends text/html"), ("/moved", "it redirects to https://new.example/")):
-            for command in (["status", MISSING], ["jobs"], ["download", MISSING]):
+        for path, what in (
+            ("", "it sends text/html"),
+            ("/moved", "it redirects to https://new.example/"),
+            ("/empty", "it sends no JSON"),
+        ):
+            for command in (["status", MISSING], ["jobs"], ["download", MISSING], ["watch", MISSING]):
                 assert f"does not answer like the service: {what}. Check the address." in sgsst(
                     [*command, "--url", server.origin + path], 1
                 )
