@@ -14,7 +14,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +108,7 @@ class Service:
             if time.monotonic() >= due:
                 try:
                     with self.request("GET", f"/v1/jobs/{job_id}") as answer:
-                        job = json.load(answer)
+                        job = self._receive(lambda: json.load(answer))
                         due = time.monotonic() + float(answer.headers["Retry-After"] or 0)
                     answered = time.monotonic()
                 except UnreachableError:
@@ -135,7 +135,7 @@ class Service:
         part, digest = out.with_name(f".sgsst-{secrets.token_hex(8)}.part"), hashlib.sha256()
         try:
             with self.request("GET", f"/v1/jobs/{job_id}/artifacts/{name}") as answer, part.open("xb") as file:
-                while block := answer.read(1 << 20):
+                while block := self._receive(lambda: answer.read(1 << 20)):
                     file.write(block)
                     digest.update(block)
             if digest.hexdigest() not in answer.headers.get("ETag", ""):
@@ -147,7 +147,7 @@ class Service:
     def json(self, method: str, path: str, body: object = None, headers: dict[str, str] | None = None) -> Any:
         """Send a request and return the JSON of its response; the arguments are those of `request`."""
         with self.request(method, path, body, headers) as answer:
-            return json.load(answer)
+            return self._receive(lambda: json.load(answer))
 
     def request(self, method: str, path: str, body: object = None, headers: dict[str, str] | None = None) -> Any:
         """Send a request and return the response; `body` is an open file, or an object to send as JSON."""
@@ -166,6 +166,22 @@ class Service:
         except ValueError as error:
             raise ServiceError(f"{self.url!r} is no address. Write it as http://127.0.0.1:8000.") from error
 
+    def _receive(self, read: Callable[[], Any]) -> Any:
+        """Return what a function reads from a response."""
+        try:
+            return read()
+        except (OSError, http.client.HTTPException) as error:
+            raise UnreachableError(f"The connection to {self.url} was lost. Try again.") from error
+        except ValueError as error:
+            raise ServiceError(self._foreign("no JSON")) from error
+
+    def _foreign(self, what: str) -> str:
+        """Return the message about another program at the address."""
+        return (
+            f"{self.url} is no service of sgsst, or one of another version ({what}). Correct the address, or update "
+            "the service."
+        )
+
     def _reason(self, error: urllib.error.HTTPError) -> str:
         """Return why the service refused a request, and what to do."""
         if error.code == 401:
@@ -178,10 +194,7 @@ class Service:
         try:
             return str(json.load(error)["detail"])
         except (ValueError, KeyError, TypeError):
-            return (
-                f"{self.url} is no service of sgsst, or one of another version (HTTP {error.code}). Correct the "
-                "address, or update the service."
-            )
+            return self._foreign(f"HTTP {error.code}")
 
 
 def orbit_options(preset: str, views: int, up: str, minutes: float) -> dict[str, Any]:

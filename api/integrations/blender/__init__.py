@@ -120,9 +120,10 @@ def start(source: Any, settings: Any, service: Service) -> None:
     style = Path(bpy.path.abspath(settings.style))
     if not style.is_file():
         raise ValueError(f"There is no style image {settings.style!r}. Choose an image file.")
+    columns = splat_columns(source.data)
     Current.folder = tempfile.TemporaryDirectory()
     scene, out = (Path(Current.folder.name) / name for name in ("splat.ply", "stylized.ply"))
-    write_splat(scene, splat_columns(source.data))
+    write_splat(scene, columns)
     options = orbit_options(settings.preset, settings.views, settings.up, settings.minutes)
     Current.job = BackgroundJob(service, (scene, style, out), **options)
     Current.source_name, Current.message = source.name, ""
@@ -139,14 +140,14 @@ def follow() -> float | None:
     assert Current.folder is not None
     if Current.job.is_alive():
         return 0.5
+    error, Current.job = Current.job.error, None  # whatever follows, another job can be started
     source = bpy.data.objects.get(Current.source_name)
-    if Current.job.error or source is None:
-        Current.message = Current.job.error or f"The object {Current.source_name} is gone. Its result was not added."
-    else:
-        result = Path(Current.folder.name) / "stylized.ply"
-        Current.message = f"Painted {show_result(source, result, bpy.context.scene.sgsst.result).name}."
-    Current.folder.cleanup()
-    Current.job = None
+    with Current.folder as folder:
+        if error or source is None:
+            Current.message = error or f"The object {Current.source_name} is gone. Its result was not added."
+        else:
+            shown = show_result(source, Path(folder) / "stylized.ply", bpy.context.scene.sgsst.result)
+            Current.message = f"Painted {shown.name}."
     return None
 
 

@@ -72,6 +72,20 @@ def test_each_failure_says_what_to_do(odd: sgsst_rest.Service, services: Service
             list(sgsst_rest.Service(url).watch("job_1"))
 
 
+@pytest.mark.parametrize(
+    ("length", "advice"), [("6", "is no service of sgsst"), ("100", "The connection to http://127.0.0.1:")]
+)
+def test_job_that_cannot_be_submitted_has_an_error(length: str, advice: str, tmp_path: Path) -> None:
+    """Programs that show a job in the background take one without an error for a success."""
+    scene, style = (tmp_path / name for name in ("scene.ply", "style.png"))
+    scene.write_bytes(b"ply")
+    with LocalServer(lambda handler: send(handler, b"<html>", Content_Length=length)) as server:
+        job = sgsst_rest.BackgroundJob(sgsst_rest.Service(server.origin), (scene, style, tmp_path / "out.ply"))
+        job.run()
+    assert job.error is not None
+    assert job.error.startswith((advice, f"{server.origin} {advice}"))
+
+
 @pytest.mark.slow
 def test_stylize_returns_the_service_s_result(
     whole_service: Service, files: tuple[Path, Path, Path], tmp_path: Path
