@@ -210,7 +210,8 @@ def _run(invocation: Invocation) -> int:
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        error_console.print("error: out of memory. Use a smaller --resolution, fewer --views or a --memory-limit.")
+        advice = "out of memory. Use a smaller --resolution, fewer --views or a --memory-limit."
+        _print_error(arguments, "out-of-memory", advice)
         return FAILURE
 
 
