@@ -9,7 +9,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
@@ -146,13 +147,12 @@ def run_service(settings: ServiceSettings, announce: Callable[[str], None]) -> N
     """
     from service.settings import missing_extras
 
-    store = _open_store(settings)
-    if settings.keys_required and not any(key.revoked_at is None for key in store.keys.all()):
-        raise SettingsError(
-            f"{settings.host} can be reached from other machines, but there is no API key. Create one with "
-            "`sgsst keys create NAME`, or serve only this machine with --host 127.0.0.1."
-        )
-    store.close()
+    with _opened(settings) as store:
+        if settings.keys_required and not any(key.revoked_at is None for key in store.keys.all()):
+            raise SettingsError(
+                f"{settings.host} can be reached from other machines, but there is no API key. Create one with "
+                "`sgsst keys create NAME`, or serve only this machine with --host 127.0.0.1."
+            )
     with _listen(settings) as listener:
         if subprocess.run([sys.executable, "-P", "-m", "service.prepare", "weights"], check=False).returncode:
             raise SettingsError(
@@ -256,22 +256,21 @@ def fsck(
     """
     from service.scheduling.housekeeping import FileCheck
 
-    store = _open_existing_store(data)
-    check, findings = FileCheck(_service_settings(data), store), []
-    for finding in check.findings(mend=mend):
-        findings.append(finding)
-        if not as_json:
-            needed = f"  needed by {', '.join(finding.holders)}" if finding.holders else ""
-            done = f"  {finding.mended}" if finding.mended else ""
-            out_console.print(f"{finding.kind:<8}  {finding.what:<10}  {finding.name}{needed}{done}")
+    settings, findings = _service_settings(data), []
+    with _opened(settings, existing=True) as store:
+        check = FileCheck(settings, store)
+        for finding in check.findings(mend=mend):
+            findings.append(finding)
+            if not as_json:
+                needed = f"  needed by {', '.join(finding.holders)}" if finding.holders else ""
+                done = f"  {finding.mended}" if finding.mended else ""
+                out_console.print(f"{finding.kind:<8}  {finding.what:<10}  {finding.name}{needed}{done}")
     if as_json:
         out_console.print(json.dumps([asdict(finding) for finding in findings]))
     kinds: list[str] = [finding.kind for finding in findings]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in _FSCK_CODES)
     error_console.print(f"Checked {check.checked} files of the database: {counts}")
-    code = sum(_FSCK_CODES[kind] for kind in set(kinds))
-    store.close()
-    raise typer.Exit(code)
+    raise typer.Exit(sum(_FSCK_CODES[kind] for kind in set(kinds)))
 
 
 @keys_app.command("create")
@@ -298,7 +297,8 @@ def create_key(
     from service.store.keys import Quotas
 
     quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
-    row, text = _open_store(_service_settings(data)).keys.create(name, priority, quotas, operator=operator)
+    with _opened(_service_settings(data)) as store:
+        row, text = store.keys.create(name, priority, quotas, operator=operator)
     if as_json:
         out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
         return
@@ -309,7 +309,8 @@ def create_key(
 @keys_app.command("list")
 def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
     """List API keys, without the keys themselves."""
-    rows = _open_store(_service_settings(data)).keys.all()
+    with _opened(_service_settings(data)) as store:
+        rows = store.keys.all()
     if as_json:
         shown = [
             {name: getattr(row, name) for name in ("id", "name", "priority", "operator")}
@@ -333,7 +334,8 @@ def revoke_key(
     data: DataOption = None,
 ) -> None:
     """Revoke an API key."""
-    row = _open_store(_service_settings(data)).keys.revoke(key_id)
+    with _opened(_service_settings(data)) as store:
+        row = store.keys.revoke(key_id)
     error_console.print(f"Revoked key {row.id} of {row.name!r}.")
 
 
@@ -347,7 +349,8 @@ def usage_of_all(data: Path, since: str | None, until: str | None) -> list[dict[
         first, last = (None if day is None else date.fromisoformat(day) for day in (since, until))
     except ValueError as error:
         raise SettingsError(f"--since, --until: {error}. Give a day such as 2026-11-21.") from error
-    rows = _open_existing_store(data).keys.usage(first, last, None)
+    with _opened(_service_settings(data), existing=True) as store:
+        rows = store.keys.usage(first, last, None)
     return [row | {"day": row["day"].isoformat()} for row in rows]
 
 
@@ -365,24 +368,24 @@ def _service_settings(data: Path | None) -> ServiceSettings:
     return read_settings()
 
 
-def _open_existing_store(data: Path | None) -> Store:
-    """Open the store of a service that has run.
+@contextmanager
+def _opened(settings: ServiceSettings, *, existing: bool = False) -> Iterator[Store]:
+    """Open the store of the service, and close it at the end of the block.
+
+    Args:
+        existing: Whether the service must have run before; otherwise, a missing database is created.
 
     Raises:
         SettingsError: If there is no database.
     """
     from sqlalchemy.engine import make_url
 
-    settings = _service_settings(data)
-    url = make_url(settings.database_url)
-    if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():  # which opening would create
-        raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
-    return _open_store(settings)
-
-
-def _open_store(settings: ServiceSettings) -> Store:
     from service.settings import keep_private
     from service.store import open_store
 
+    url = make_url(settings.database_url)
+    if existing and url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():
+        raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
     keep_private(settings)
-    return open_store(settings)
+    with closing(open_store(settings)) as store:
+        yield store
