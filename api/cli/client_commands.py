@@ -307,6 +307,8 @@ def usage(
 
     A key shows its own usage, an operator's key or --data that of all keys.
     """
+    if data is not None and (url or key):
+        raise SettingsError("--data reads a database, --url and --key ask a service. Omit --data, or the others.")
     if data is None:
         with open_client(url, key) as client:
             rows = client.usage(since, until)

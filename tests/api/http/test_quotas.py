@@ -108,6 +108,7 @@ def test_usage_of_own_key_and_of_all_keys(
         }.items()
         assert next(iter(used)) in sgsst(["usage", *command])
         assert "2026-11-21" in sgsst(["usage", "--since", "monday", *command], 2)
+    assert "Omit --data, or the others" in sgsst(["usage", "--data", str(service.data), "--url", service.url], 2)
 
 
 def test_connections_are_limited(service: Service) -> None:
