@@ -19,10 +19,10 @@ from api.cli.console import (
     EARLY_ENDS,
     JOB_FAILED,
     PlainConsole,
+    counting_bar,
     error_console,
     loss_text,
     out_console,
-    transfer_bar,
 )
 from api.cli.options import (
     JsonOption,
@@ -112,7 +112,7 @@ def submit(
                 plan = client.plan(inputs.scene, styles, **files, progress=progress, planning=planning, **settings)
             out_console.print(json.dumps(plan) if as_json else _plan_text(plan))
             return
-        with transfer_bar(error_console, "sending") as progress:
+        with counting_bar("sending") as progress:
             settings |= {"webhook": webhook, "webhook_events": webhook_events or ()}
             job = client.submit(inputs.scene, styles, **files, progress=progress, **settings)
         if out is None:
@@ -223,7 +223,7 @@ def download(
                     f"{target}: exists, and is not this job's file. Write to another file with --out, or pass "
                     "--overwrite."
                 )
-            with transfer_bar(error_console, each) as progress:
+            with counting_bar(each) as progress:
                 written.append(str(client.download(job, target, each, progress)))
     out_console.print(json.dumps(written) if as_json else "\n".join(written))
 
@@ -412,7 +412,7 @@ def conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
         error_console.print(
             f"Steps: {_step_count_text(result)}; loss {loss_text(result['loss_before'], result['loss_after'])}"
         )
-    with transfer_bar(error_console, out.name) as progress:
+    with counting_bar(out.name) as progress:
         client.download(job.id, out, progress=progress)
     out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
 

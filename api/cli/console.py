@@ -87,14 +87,15 @@ def print_field(name: str, value: object) -> None:
 
 
 @contextmanager
-def transfer_bar(console: Console, description: str) -> Iterator[Callable[[int, int], None]]:
-    """Show the progress of a transfer; yield a function that receives the transferred and the total bytes."""
-    from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
+def counting_bar(description: str, *, in_bytes: bool = True) -> Iterator[Callable[[int, int], None]]:
+    """Show the progress of a transfer or of other work; yield a function that receives what is done, and the total."""
+    from rich.progress import BarColumn, DownloadColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
     from sgsst_core.progress import live_bar
 
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with live_bar(console, *columns) as bar:
+    count = DownloadColumn() if in_bytes else MofNCompleteColumn()
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), count, TimeRemainingColumn())
+    with live_bar(error_console, *columns) as bar:
         task = bar.add_task(description, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total or None)
 

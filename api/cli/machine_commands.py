@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.table import Table
 
-from api.cli.console import FAILURE, PlainConsole, error_console, leave_terminal, out_console, transfer_bar
+from api.cli.console import FAILURE, PlainConsole, counting_bar, error_console, leave_terminal, out_console
 from api.cli.options import JsonOption
 from sgsst_core.errors import SettingsError
 from worker.processes import STOP_SIGNALS
@@ -89,7 +89,7 @@ def fetch(
     """Download and convert weights into the cache folder; do nothing if they are installed."""
     from sgsst_core.features.network_weights import fetch_network_weights
 
-    with transfer_bar(error_console, name) as progress:
+    with counting_bar(name) as progress:
         path = fetch_network_weights(name, source=from_, progress=progress)
     out_console.print(f"{name}: {path}")
 

@@ -5,18 +5,16 @@ Results are compared by benchmarks on one's own scene and machine (`bench`), and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
-from api.cli.console import error_console, out_console, print_field
+from api.cli.console import counting_bar, error_console, out_console, print_field
 from api.cli.options import (
     CamerasOption,
     JobArguments,
@@ -34,7 +32,7 @@ from api.cli.options import (
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
-from sgsst_core.progress import duration, job_bar, live_bar
+from sgsst_core.progress import duration, job_bar
 from worker.job import JobSpec, Outputs, SceneRequest, check_suffix
 from worker.options import (
     ESSENTIALS,
@@ -170,7 +168,7 @@ def render(
 
         request = VideoRequest(source, video, video_options, background, compare, transparent)
         check_video_request(request)
-        with _frame_bar() as progress:
+        with counting_bar("rendering", in_bytes=False) as progress:
             shown = render_video(request, progress, _print_warning)
         fps, size = video_options.fps, f"{shown[0].width}x{shown[0].height}"
         out_console.print(f"{len(shown)} frames of {size}, {len(shown) / fps:.3g} s at {fps} per second, in {video}")
@@ -179,28 +177,19 @@ def render(
     elif panorama is not None:
         from api.cli.scene_tools import render_panorama
 
-        with _frame_bar() as progress:
+        with counting_bar("rendering", in_bytes=False) as progress:
             camera = render_panorama(source, background, position, panorama, progress, _print_warning)
         print_field("panorama", f"{panorama}, from the position of {camera.name}")
     elif out is not None:
         from api.cli.scene_tools import render_views
 
-        with _frame_bar() as progress:
+        with counting_bar("rendering", in_bytes=False) as progress:
             paths = render_views(source, background, out, progress, _print_warning)
         out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
 
 
 def _print_warning(line: str) -> None:
     error_console.print(f"warning: {line}")
-
-
-@contextmanager
-def _frame_bar() -> Iterator[Callable[[int, int], None]]:
-    """Show the progress of rendering; yield a function that receives the numbers of completed and of all images."""
-    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with live_bar(error_console, *columns) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 @with_options(ViewOptions, only=("near", "drop_invalid", "spz_axes", "render_mode", "eps2d"))
@@ -377,9 +366,8 @@ def paint(
         return
     paintings = tuple(PaintedFile.parse(text) for text in view or ())
     request = JobSpec(source=source, styles=(), out=out, settings=settings, paintings=paintings)
-    with live_bar(error_console) as bar:
-        task = bar.add_task("painting", total=None)
-        listener = Listener(progress=lambda now: bar.update(task, completed=now.step, total=now.total))
+    with counting_bar("painting", in_bytes=False) as progress:
+        listener = Listener(progress=lambda now: progress(now.step, now.total))
         result = run_painting(request, listener, WorkerOptions())
     print_field("painted pixels", f"{result.psnr_before:.1f} dB before, {result.psnr_after:.1f} dB after")
     print_field("scene", out)

@@ -24,12 +24,12 @@ from api.cli.console import (
     FAILURE,
     JOB_FAILED,
     Invocation,
+    counting_bar,
     error_console,
     leave_terminal,
     loss_text,
     out_console,
     print_field,
-    transfer_bar,
 )
 from api.cli.machine_commands import fetch
 from api.cli.options import (
@@ -454,7 +454,7 @@ def _submitted(client: Client, job_id: str, name: str, request: JobSpec, options
             raise
     source, images = request.source, [image.path for image in request.styles]
     parameters = options.model_dump(mode="json", exclude_unset=True)
-    with transfer_bar(error_console, name) as progress:
+    with counting_bar(name) as progress:
         return client.submit(source.scene, images, cameras=source.cameras, progress=progress, **parameters).id
 
 
