@@ -353,11 +353,9 @@ def _find_file(context: Context, shared: Shared, name: str) -> SentFile:
     Raises:
         NO_SHARED_FILE: If the job has no such file, such as `colors.f16` after Gaussians were split.
     """
-    entry = find_input(context.store.jobs, shared.job, name)
-    if entry is not None:
-        if blob := context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"]):
-            return input_file(context, shared.job.owner, blob, name, _KIND)
-    elif row := _result(context, shared.job.id, name):
+    if stored := find_input(context, shared.job, name):
+        return input_file(context, shared.job.owner, stored[1], name, _KIND)
+    if row := _result(context, shared.job.id, name):
         kind = media_type(row.name) if name == "poster" else _KIND
         return replace(artifact_file(context, shared.job.owner, row, name, kind), policy=INPUT_POLICY)
     raise problems.NO_SHARED_FILE(name=name)

@@ -59,7 +59,6 @@ from service.settings import check_weights
 from service.states import ENDED, JobStatus
 from service.store import Store
 from service.store.files import BLOBS
-from service.store.jobs import Jobs
 from service.store.tables import ArtifactRow, BlobRow, EventRow, JobRow
 from sgsst_core.files.formats import EXTRA_FORMATS, DownloadName, by_name, listed, result_name
 from sgsst_core.files.formats.ply import PLY
@@ -667,13 +666,10 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
     Raises:
         NO_INPUT: If the job has no such input, or has expired and released its inputs.
     """
-    job = find(context, caller, job_id)
-    entry = find_input(context.store.jobs, job, role)
-    if entry is not None:
-        row = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
-        if row is not None:
-            return entry, row
-    raise problems.NO_INPUT(job_id=job.id, name=role[:40])
+    stored = find_input(context, find(context, caller, job_id), role)
+    if stored is None:
+        raise problems.NO_INPUT(job_id=job_id, name=role[:40])
+    return stored
 
 
 def parse_input(name: str) -> tuple[str, int] | None:
@@ -682,10 +678,12 @@ def parse_input(name: str) -> tuple[str, int] | None:
     return (match[1], int(match[2] or 0)) if match else None
 
 
-def find_input(jobs: Jobs, job: JobRow, name: str) -> dict[str, Any] | None:
-    """Return a job's entry for an input such as "scene" or "style:1"; None if it is missing or was released."""
+def find_input(context: Context, job: JobRow, name: str) -> tuple[dict[str, Any], BlobRow] | None:
+    """Return a job's entry for an input such as "scene" or "style:1" and its blob; None if it is gone or never was."""
     place = parse_input(name)
-    return None if place is None or job.status == JobStatus.EXPIRED else jobs.input(job.id, *place)
+    entry = None if place is None or job.status == JobStatus.EXPIRED else context.store.jobs.input(job.id, *place)
+    row = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"]) if entry else None
+    return (entry, row) if entry and row else None
 
 
 artifacts_router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
