@@ -276,7 +276,7 @@ def _read_variants(
     read = {"scene": file.scene, "cameras": capture.cameras, "style": style, "variants": compared, "weights": weights}
     described = {
         "version": 1,
-        "scene": inputs.scene.parent.name + "/" + inputs.scene.name,
+        "scene": "/".join(inputs.scene.absolute().parts[-2:]),
         "style": inputs.style.name,
         "views": len(capture.cameras),
         "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in capture.cameras})],
