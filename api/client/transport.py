@@ -109,28 +109,24 @@ class Transport:
             RequestError, ApiError: As for `call`.
         """
         json_text(options.get("json"))
-        result: dict[str, Any] = {}
 
-        async def once() -> None:
+        async def once() -> dict[str, Any]:
             async with self.http.sse(path, method="POST", **options) as source:
                 self.reached = True
                 if not has_events(source.response):
                     await source.response.aread()
-                    result.update(parsed(checked(source.response)))
-                    return
+                    return dict(parsed(checked(source.response)))
                 async for event in source:
-                    data = json.loads(event.data or "{}")  # messages without data only keep the connection alive
+                    data: dict[str, Any] = json.loads(event.data or "{}")
                     if event.event == "problem":
                         raise refusal(data["detail"], data["status"], data)
-                    if event.event != step:
-                        result.update(data)
-                    elif data["total"]:  # stages of unknown length have no steps
+                    if data and event.event != step:  # messages without data only keep the connection alive
+                        return data
+                    if data.get("total"):  # stages of unknown length have no steps
                         progress(data["step"], data["total"])
+            raise ApiError("The connection ended before the result arrived. Try again.", 502)  # a proxy cut it off
 
-        await self._retry(once)
-        if not result:  # the service was stopped, or a proxy cut the response off
-            raise ApiError("The connection ended before the result arrived. Try again.", 502)
-        return result
+        return await self._retry(once)
 
     async def fetch(self, path: str, target: Path, progress: Progress) -> None:
         """Download a file, and check its SHA-256. A broken download is resumed, also that of an earlier process.

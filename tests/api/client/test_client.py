@@ -446,6 +446,22 @@ def test_events_resume_after_errors_of_a_proxy(connect: Any) -> None:
 
 
 @both
+def test_work_whose_stream_ends_without_a_result_is_requested_again(connect: Any) -> None:
+    streams = [
+        b'event: video\ndata: {"name": "video.mp4"}\n\n',
+        b'event: rendering\ndata: {"step": 1, "total": 2}\n\n',
+    ]
+
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        handler.rfile.read(int(handler.headers["Content-Length"]))
+        send(handler, streams.pop(), Content_Type="text/event-stream")
+
+    with LocalServer(answer) as server, connect(server.origin) as client:
+        assert client.video("job_1") == "video.mp4"
+    assert streams == []
+
+
+@both
 def test_upload_resumes_after_lost_connection(
     connect: Any, service: Service, paths: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
