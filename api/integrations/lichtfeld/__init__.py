@@ -151,7 +151,7 @@ class SgsstPanel(lf.ui.Panel):
                 self._draw_progress(ui, SgsstPanel.running)
             if self._painting is not None:
                 self._draw_comparison(ui, self._painting)
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             self._message = str(error)
         if self._message:
             ui.text_wrapped(self._message)
@@ -184,7 +184,7 @@ class SgsstPanel(lf.ui.Panel):
                 lf.ui.request_redraw()
                 return
             self._message = f"{running.painting.name} is painted. Edit > Undo restores it."
-        except ValueError:
+        except (ValueError, OSError):
             running.job.canceled.set()
             self._painting = SgsstPanel.running = None
             raise
