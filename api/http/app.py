@@ -16,6 +16,7 @@ from typing import Any
 
 import anyio.to_thread
 from fastapi import FastAPI
+from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
@@ -226,7 +227,7 @@ class Adapted:
             if not f"{scope['path']}/".startswith(f"{root}/"):
                 scope["path"] = root + scope["path"]
             if f"{path_of(scope)}/".startswith(f"{_UPLOADS}/"):
-                scope["method"] = _header(scope, b"x-http-method-override") or scope["method"]
+                scope["method"] = Headers(scope=scope).get("x-http-method-override", "").strip() or scope["method"]
             if scope["method"] == "HEAD" and "GET" in (routed := routed_methods(scope)) and "HEAD" not in routed:
                 scope["method"], send = "GET", _head_of(send)
         await self._app(scope, receive, send)  # type: ignore[arg-type]
@@ -236,7 +237,7 @@ class Adapted:
         client = scope.get("client")
         if not client or client[0] not in self._app.trusted_hosts:
             return ""
-        prefix = _header(scope, b"x-forwarded-prefix").rstrip("/")
+        prefix = Headers(scope=scope).get("x-forwarded-prefix", "").strip().rstrip("/")
         return prefix if is_subpath(prefix) else ""
 
 
@@ -311,9 +312,3 @@ def _head_of(send: Send) -> Send:
             await send({"type": "http.response.body"})
 
     return send_head
-
-
-def _header(scope: Scope, name: bytes) -> str:
-    """Return a header of a request; an empty string if it is missing."""
-    values: list[bytes] = [value for key, value in scope["headers"] if key == name]
-    return values[0].decode("latin-1").strip() if values else ""

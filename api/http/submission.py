@@ -15,8 +15,7 @@ import secrets
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack, suppress
-from datetime import UTC, datetime
-from email.utils import format_datetime
+from email.utils import formatdate
 from functools import partial
 from typing import Annotated, Any
 
@@ -209,7 +208,7 @@ async def create_upload(
     response_headers = {
         **_HEADERS,
         "Location": address(f"/v1/uploads/{row.id}"),
-        "Upload-Expires": _http_date(row.expires_at),
+        "Upload-Expires": formatdate(row.expires_at, usegmt=True),
     }
     return Response(upload_view(row).model_dump_json(), 201, response_headers, "application/json")
 
@@ -245,7 +244,7 @@ def head_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> 
         **_HEADERS,
         "Upload-Offset": str(row.offset),
         "Upload-Length": str(row.length),
-        "Upload-Expires": _http_date(row.expires_at),
+        "Upload-Expires": formatdate(row.expires_at, usegmt=True),
     }
     if row.metadata_header:
         response_headers["Upload-Metadata"] = row.metadata_header
@@ -315,9 +314,8 @@ async def append_upload(
         async for _ in body_blocks(request, context.settings):
             raise _longer_than_declared(row.length)
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
-    return Response(
-        status_code=204, headers={**_HEADERS, "Upload-Offset": str(row.offset), "Upload-Expires": _http_date(expires)}
-    )
+    response_headers = {"Upload-Offset": str(row.offset), "Upload-Expires": formatdate(expires, usegmt=True)}
+    return Response(status_code=204, headers=_HEADERS | response_headers)
 
 
 @uploads_router.delete(
@@ -432,10 +430,6 @@ def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
     if not is_id(upload_id):
         raise problems.NO_UPLOAD(upload_id=upload_id[:60])
     return context.store.inputs.upload(upload_id, owner)
-
-
-def _http_date(seconds: float) -> str:
-    return format_datetime(datetime.fromtimestamp(seconds, UTC), usegmt=True)
 
 
 def uploaded_name(metadata: str) -> str:
