@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path, PureWindowsPath
 from typing import Annotated, Any, get_args
 
 import typer
-from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+from rich.progress import BarColumn, TextColumn
 from rich.table import Column, Table
 from stamina.instrumentation import RetryDetails, set_on_retry_hooks
 
@@ -108,8 +107,8 @@ def submit(
     files["painted"] = {file.path: file.options.model_dump(exclude_none=True) for file in inputs.painted}
     with open_client(url, key) as client:
         if dry_run:
-            with _sending_and_planning() as (progress, planning):
-                plan = client.plan(inputs.scene, styles, **files, progress=progress, planning=planning, **settings)
+            with counting_bar("checking", in_bytes=False) as planning:
+                plan = client.plan(inputs.scene, styles, **files, planning=planning, **settings)
             out_console.print(json.dumps(plan) if as_json else _plan_text(plan))
             return
         with counting_bar("sending") as progress:
@@ -355,19 +354,6 @@ def open_client(url: str | None, key: str | None) -> Client:
 def _print_retry(details: RetryDetails) -> None:
     what = str(details.caused_by) or type(details.caused_by).__name__
     error_console.print(f"{what}: retrying in {details.wait_for:.0f} s")
-
-
-@contextmanager
-def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
-    """Show a progress bar of the sent bytes, then of the surveyed views; only on a terminal."""
-    columns = TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn()
-    with live_bar(error_console, *columns) as bar:
-        task = bar.add_task("checking", total=None)
-
-        def shown_as(what: str) -> Any:
-            return lambda done, total: bar.update(task, description=what, completed=done, total=total or None)
-
-        yield shown_as("sending"), shown_as("planning")
 
 
 def follow(client: Client, job_id: str, as_json: bool) -> Job:
