@@ -177,7 +177,7 @@ def _run(invocation: Invocation) -> int:
         code = app(args=arguments, prog_name="sgsst", obj=invocation, standalone_mode=False)
         return code if isinstance(code, int) else 0
     except _UsageError as error:
-        error.message = error.message.removeprefix("Value error, ")  # typer validates words with pydantic
+        error.message = error.message.removeprefix("Value error, ")  # typer validates by pydantic
         if "--json" in arguments:
             _print_error(arguments, "usage", error.format_message())
         else:

@@ -140,26 +140,11 @@ def _parameter(option: Declared) -> inspect.Parameter:
     placeholder: dict[str, Any] = {} if is_switch(option) else {"metavar": metavar(option)}
     group = next((title for title, names in GROUPS.items() if option.name in names), None)
     declaration = typer.Option(
-        flags(option), help=help_text(option), parser=_parser(option), rich_help_panel=group, **placeholder
+        flags(option), help=help_text(option), parser=option.option.parse, rich_help_panel=group, **placeholder
     )
     return inspect.Parameter(
         option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, declaration]
     )
-
-
-def _parser(option: Declared) -> Callable[[str], object] | None:
-    """Return the parser of an option for typer, which would drop the message of a ValueError."""
-    parse = option.option.parse
-    if parse is None:
-        return None
-
-    def parse_or_refuse(text: str) -> object:
-        try:
-            return parse(text)
-        except ValueError as error:
-            raise typer.BadParameter(str(error)) from error
-
-    return parse_or_refuse
 
 
 def kind_of(option: Declared) -> Any:
