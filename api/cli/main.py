@@ -197,8 +197,6 @@ def _run(invocation: Invocation) -> int:
     except (KeyboardInterrupt, typer.Abort):
         error_console.print(ABORTED)
         return INTERRUPTED
-    except BrokenPipeError:  # for example `sgsst weights list | head`
-        return FAILURE
     except OSError as error:  # such as a name that is too long, a folder that denies access, or a full disk
         full = error.errno in DISK_FULL
         if error.filename is None and not full:
