@@ -15,7 +15,7 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.context import SESSION_COOKIE, CallerDep, Context, ContextDep, check_origin, check_site, is_id
-from api.http.jobs import INPUT_POLICY, JobId, artifact_file, find, find_input, input_file
+from api.http.jobs import INPUT_POLICY, JobId, artifact_file, find_input, input_file
 from api.http.problems import headers, links, raises
 from api.http.receiving import json_body
 from api.http.schemas import (
@@ -200,7 +200,7 @@ async def create_share(
     Whoever has the link sees the scene before and after in 3D, and nothing else, until it expires or is revoked. The
     link also ends with the results of the job, and if the key that created the job is revoked.
     """
-    job = await asyncio.to_thread(find, context, caller, job_id)
+    job = await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
     if new.poster and job.viewpoints and (start := job.viewpoints["start"]):
         await context.derived.poster(job, start, caller.quotas)  # a continued job has lost its own
     row, token = await asyncio.to_thread(context.store.shares.create, job_id, caller.owner, new.days * _DAY)
@@ -214,7 +214,7 @@ async def create_share(
 @router.get("/v1/jobs/{job_id}/shares", response_model=ShareList)
 def list_shares(job_id: JobId, context: ContextDep, caller: CallerDep) -> ShareList:
     """List the links to the result of a job that have not expired. Their tokens are not stored."""
-    find(context, caller, job_id)
+    context.store.jobs.get(job_id, caller.owner)
     return ShareList(shares=[view_of(ShareView, row) for row in context.store.shares.of_job(job_id)])
 
 
@@ -230,7 +230,7 @@ def revoke_share(
     caller: CallerDep,
 ) -> None:
     """Revoke a link to the result of a job."""
-    find(context, caller, job_id)
+    context.store.jobs.get(job_id, caller.owner)
     if not is_id(share_id):
         raise problems.NO_SHARE()
     context.store.shares.revoke(job_id, share_id)

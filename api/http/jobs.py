@@ -397,7 +397,7 @@ async def change_job(
     job_id: JobId, context: ContextDep, caller: CallerDep, change: Annotated[JobChange, Depends(json_body(JobChange))]
 ) -> Response:
     """Rename a job, whatever its status, or set the viewpoints of a finished one."""
-    job = await asyncio.to_thread(find, context, caller, job_id)
+    job = await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
     if change.viewpoints is not None:
         if job.status != JobStatus.SUCCEEDED:
             raise problems.NO_RESULT(job_status=job.status)
@@ -417,7 +417,7 @@ def _rename(context: Context, caller: Caller, job_id: str, name: str) -> None:
 @router.get("/{job_id}/progress", response_model=ProgressHistory)
 def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
     """Get the loss history of a job from its first step on, while it runs and after its end."""
-    points = context.store.jobs.loss_history(find(context, caller, job_id), MOST_POINTS)
+    points = context.store.jobs.loss_history(context.store.jobs.get(job_id, caller.owner), MOST_POINTS)
     return ProgressHistory.model_validate({"points": points})
 
 
@@ -451,7 +451,7 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
 )
 def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Queue a failed or canceled job again, or one that was stopped early. It resumes from its last checkpoint."""
-    stored_parameters(find(context, caller, job_id).parameters)
+    stored_parameters(context.store.jobs.get(job_id, caller.owner).parameters)
     check_weights()
     context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key, quotas=caller.quotas)
     return _job_response(context, caller, job_id, status=202)
@@ -463,15 +463,6 @@ async def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> N
     unused = await asyncio.to_thread(context.store.jobs.delete, job_id, caller.owner)
     results, inputs = partial(context.artifacts.objects.remove_below, job_id), partial(context.blobs.remove, unused)
     await context.receipts.remove(caller.owner, results, inputs)
-
-
-def find(context: Context, caller: Caller, job_id: str) -> JobRow:
-    """Return the caller's job with this id.
-
-    Raises:
-        NO_JOB: If there is no such job, or it belongs to another caller.
-    """
-    return context.store.jobs.get(job_id, caller.owner)
 
 
 def _job_response(
@@ -544,7 +535,7 @@ async def watch_job(
     ] = None,
 ) -> Response:
     """Watch a job. Resume an interrupted stream with `Last-Event-ID`, which browsers' `EventSource` sends by itself."""
-    await asyncio.to_thread(find, context, caller, job_id)
+    await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
     after = await context.hub.resumed(job_id, last_event_id) if last_event_id else 0
     if after is None:
         return Response(status_code=204)
@@ -596,7 +587,7 @@ async def list_inputs(
     limit: Annotated[Digits, Query(ge=1, le=1000, description="Files on a page.", examples=[1000])] = 1000,
 ) -> Response:
     """List the files that a job was created from, photos and masks included."""
-    await asyncio.to_thread(find, context, caller, job_id)
+    await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
 
     def read(start: str | None, most: int) -> tuple[list[InputFileView], str | None]:
         position = int(start or 0)
@@ -666,7 +657,7 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
     Raises:
         NO_INPUT: If the job has no such input, or has expired and released its inputs.
     """
-    stored = find_input(context, find(context, caller, job_id), role)
+    stored = find_input(context, context.store.jobs.get(job_id, caller.owner), role)
     if stored is None:
         raise problems.NO_INPUT(job_id=job_id, name=role[:40])
     return stored
@@ -718,7 +709,7 @@ async def list_artifacts(
     limit: Annotated[Digits, Query(ge=1, le=1000, description="Files on a page.", examples=[1000])] = 1000,
 ) -> Response:
     """List the files that a job has made so far, by name. A running job has its plan and previews."""
-    await asyncio.to_thread(find, context, caller, job_id)
+    await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
 
     def read(after: str | None, most: int) -> tuple[list[ArtifactView], str | None]:
         page = context.store.jobs.artifacts(job_id, after or "", most + 1)
@@ -769,7 +760,7 @@ async def get_artifact(
     ] = None,
 ) -> Response:
     """Download a file, whole or in ranges. Resume with `Range` and `If-Range`."""
-    job = await asyncio.to_thread(find, context, caller, job_id)
+    job = await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
     row = await _find_artifact(context, caller, job, name, format_)
     # the suggested name includes the job's, so that results of jobs differ
     plain, last = _NO_WORD.sub("_", job.name).strip("._")[:60], PurePosixPath(row.name).name
@@ -828,8 +819,8 @@ async def create_blend(
     if len({job_id, *others}) != 1 + len(body.others):
         raise problems.INVALID_REQUEST("others: A job is named twice. Give each job one weight.")
     for other in others:
-        await asyncio.to_thread(find, context, caller, other)
-    job = await asyncio.to_thread(find, context, caller, job_id)
+        await asyncio.to_thread(context.store.jobs.get, other, caller.owner)
+    job = await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
     row = await context.derived.blended(job, Blend(body.weight, others, by_name(body.format)), caller.quotas)
     view = artifact_view(row)
     return Response(view.model_dump_json(), 201, {"Location": view.url}, media_type="application/json")
@@ -847,7 +838,7 @@ async def make_video(
 
     The video is completed even if the client closes the connection; repeat the request to wait for it again.
     """
-    job = await asyncio.to_thread(find, context, caller, job_id)
+    job = await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
 
     async def work(show: Any) -> ArtifactView:
         return artifact_view(await context.derived.video(job, options, caller.quotas, show))

@@ -23,7 +23,7 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, Digits, is_id
-from api.http.jobs import DRY_RUN, FOLLOWING_OPERATIONS, answer_work, find, parse_input
+from api.http.jobs import DRY_RUN, FOLLOWING_OPERATIONS, answer_work, parse_input
 from api.http.problems import headers, links, raises
 from api.http.receiving import (
     MAX_TEXT,
@@ -778,7 +778,7 @@ def _referred_results(context: Context, caller: Caller, received: Received) -> d
         if reference := _RESULT_PATH.fullmatch(text.removeprefix(subpath.get())):
             row = None
             with suppress(NotFoundError):
-                row = context.store.jobs.artifact(find(context, caller, reference[1]).id, RESULT)
+                row = context.store.jobs.artifact(context.store.jobs.get(reference[1], caller.owner).id, RESULT)
             if row is None:
                 raise problems.UNKNOWN_INPUT(job_id=reference[1], name=RESULT, input=role)
             results[text] = row
@@ -806,7 +806,7 @@ def _referred_input(
     """
     with suppress(NotFoundError):
         if job_id not in released:
-            released[job_id] = find(context, caller, job_id).status == JobStatus.EXPIRED
+            released[job_id] = context.store.jobs.get(job_id, caller.owner).status == JobStatus.EXPIRED
         place = parse_input(name)
         entry = context.store.jobs.input(job_id, *place) if place and not released[job_id] else None
         if entry is not None:
