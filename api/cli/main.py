@@ -186,7 +186,8 @@ def _run(invocation: Invocation) -> int:
     except SgsstError as error:
         _print_error(arguments, error.code, str(error), getattr(error, "problem", None))
         usual = BAD_INPUT if isinstance(error, InvalidInputError) else FAILURE
-        return {404: NOT_FOUND, 409: CONFLICT}.get(getattr(error, "status", 0), usual)  # status of a response
+        codes = {404: NOT_FOUND, 409: CONFLICT, 422: BAD_INPUT}
+        return codes.get(getattr(error, "status", 0), usual)  # status of a response, or of the service's own error
     except ModuleNotFoundError as error:
         module = (error.name or "").partition(".")[0]
         if module not in _EXTRAS:
@@ -213,9 +214,10 @@ def _run(invocation: Invocation) -> int:
         return FAILURE
 
 
-def _print_error(arguments: Sequence[str], code: str, detail: str, problem: Mapping[str, object] | None = None) -> None:
-    """Print an error on stderr; with --json, as a line of JSON with the fields of a problem document."""
+def _print_error(arguments: Sequence[str], code: str, detail: str, problem: object = None) -> None:
+    """Print an error on stderr; with --json, as a line of JSON with the fields of a problem document, if any."""
     if "--json" in arguments:
-        print(json.dumps({"code": code, "detail": detail, **(problem or {})}), file=sys.stderr)
+        document = problem if isinstance(problem, Mapping) else {}  # the service's own errors have its type instead
+        print(json.dumps({"code": code, "detail": detail, **document}), file=sys.stderr)
     else:
         error_console.print(f"error: {detail}")
