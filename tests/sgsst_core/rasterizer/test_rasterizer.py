@@ -42,7 +42,7 @@ from tests.sgsst_core.splat_scenes import (
 #: Relative distance from a cutoff within which float32 rounding may change the decision.
 CLOSE = 2e-5
 #: Rasterizers of the CPU; `test_triton.py` compares `cached`, which runs in Triton's interpreter here.
-ALL = [*(each for each in RASTERIZERS.values() if not each.on_gpu), ReferenceRasterizer]
+ALL: list[type[Rasterizer]] = [*(each for each in RASTERIZERS.values() if not each.on_gpu), ReferenceRasterizer]
 ALL.remove(CachedRasterizer)
 kinds = pytest.mark.parametrize("kind", ALL, ids=lambda kind: kind.name)
 
