@@ -1,7 +1,5 @@
 """Files of `api/static` with the program's tables filled in, for the service and for exported pages."""
 
-from __future__ import annotations
-
 import json
 import posixpath
 import re

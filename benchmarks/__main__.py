@@ -6,8 +6,6 @@ DATA has scenes/ and styles/. Results that were measured on the same code are no
 where it was stopped. The exit status is 1 if a command fails.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Inputs of the benchmarks, and storage of their results with a description of the machine."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

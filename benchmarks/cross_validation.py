@@ -15,8 +15,6 @@ mean score on pairs with another scene and another painting is chosen, or the de
 its figures are reported. `second-seed` differs from the default by chance alone, and is never chosen.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

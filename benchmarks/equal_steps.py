@@ -19,8 +19,6 @@ With --region SPEC, the cameras are those that show the region. The additional s
 own content weight, and "region_content" is "content" over its pixels alone, on black.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -14,8 +14,6 @@ better preset reaches the loss that a preset leaves are those of the curve in it
 is scaled so that it ends with the evaluated loss.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import tempfile

@@ -7,8 +7,6 @@ page shows the scene, in a service that has run no job: until it shows the paint
 result. The views are an orbit.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import subprocess

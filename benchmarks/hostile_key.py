@@ -7,8 +7,6 @@ and uploads that are created and deleted. Meanwhile, another key submits small j
 that are new to the service. The target is a 99th percentile below 2 s. Client and service run on the same machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import itertools

@@ -7,8 +7,6 @@ peak that the kernel reports (`VmHWM`) and the memory after a few ordinary reque
 has grown by 1 GB. The target is a growth of at most 64 MB for each attack.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import re

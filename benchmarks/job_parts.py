@@ -6,8 +6,6 @@ Scenes of millions of Gaussians are copies of the given one (`large_scene.multip
 own. What its report does not name is the process's own start and end, in `unnamed`. Medians are stored.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

@@ -6,8 +6,6 @@ The scene is generated: each of its Gaussians is copied several times, copies ar
 and scales are reduced so that the total volume stays the same. Everything is seeded. Figures are medians over views.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import time

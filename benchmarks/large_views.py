@@ -5,8 +5,6 @@ python -m benchmarks.large_views SCENE.ply CAMERAS STYLE [--steps 2] [--memory 1
 CAMERAS is a camera file, or orbit:N.
 """
 
-from __future__ import annotations
-
 import time
 
 import torch

@@ -11,8 +11,6 @@ and after the steps, counts with its least seconds over the rounds; the range is
 the lean job of its round. Results are stored after each scene, beside those of others.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

@@ -15,8 +15,6 @@ orbit. Each pair is stored in benchmarks/results/methods.json when it is done; w
 run again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

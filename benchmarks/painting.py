@@ -7,8 +7,6 @@ sides. The program gets one view of the edited scene, and is judged on five othe
 affine map of all colors, and the change of the nearest neighbors. Figures are PSNR in dB.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from dataclasses import replace

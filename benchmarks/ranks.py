@@ -5,8 +5,6 @@ python -m benchmarks.ranks SCENE.ply CAMERAS|orbit:N STYLE [--memory 16]
 Ranks are gloo processes on this machine; steps on one and on both ranks take turns.
 """
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 from collections.abc import Callable

@@ -8,8 +8,6 @@ of `sgsst stylize` with the same seed (different). A job on two ranks adds numbe
 are compared with those of a one-rank job within a tolerance.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

@@ -11,8 +11,6 @@ and watchers alternate between them, so half of the watchers receive the running
 process.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib

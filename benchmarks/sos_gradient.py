@@ -8,8 +8,6 @@ features of a block and its margin; the gradient of the margin is discarded afte
 in every iteration. The baseline uses this project's network code, so that only the method differs.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable

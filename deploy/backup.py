@@ -12,8 +12,6 @@ copies. The exception is a checkpoint that was created and replaced in between: 
 again, up to three times in total. A job whose checkpoint is still missing restarts from the first step.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sqlite3

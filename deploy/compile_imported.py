@@ -1,7 +1,5 @@
 """Import all modules of the programs, so that the image contains their bytecode: it is read-only at run time."""
 
-from __future__ import annotations
-
 import importlib
 
 PROGRAMS = (

@@ -11,8 +11,6 @@ The wheel of PyTorch without CUDA comes from https://download.pytorch.org/whl/cp
 `cuda.txt` the additional packages of each image.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 import subprocess

@@ -5,8 +5,6 @@ too. The script runs as root in a separate container before all others (`secrets
 only the passwords that it needs.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import secrets

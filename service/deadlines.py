@@ -10,8 +10,6 @@ few of them, so a hanging file of one owner does not stop the others. Work that 
 stays occupied until the file store answers.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import tempfile

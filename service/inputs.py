@@ -3,8 +3,6 @@
 The staging folder has links to the blobs under the users' names. PyTorch is not imported.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections import Counter

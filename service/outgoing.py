@@ -4,8 +4,6 @@ Each request has its own connection, to an address that was checked. Nothing dep
 certificate authorities of its own. Callers limit the time and the bytes of the response.
 """
 
-from __future__ import annotations
-
 import asyncio
 import ipaddress
 import re

@@ -8,8 +8,6 @@ until both the database and the file store respond.
 Without names, that is VGG16, but only if neither VGG19 nor VGG16 is installed.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ In addition, what every process does at its start: set up its log, the permissio
 network weights.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import json
 import logging

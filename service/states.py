@@ -3,8 +3,6 @@
 In addition, what the process of an attempt reports, because this module imports no database.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """Style transfer for 3D Gaussian Splatting scenes: the core library, without command line or HTTP API."""
 
-from __future__ import annotations
-
 import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -1,7 +1,5 @@
 """Memory budgets: how much memory is available, and caches that respect a limit."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Callable, Hashable

@@ -1,7 +1,5 @@
 """Numba configuration of this package: the kernel decorator, and the lock and thread count under which kernels run."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import threading

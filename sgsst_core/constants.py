@@ -4,8 +4,6 @@ The values are those of gsplat 1.6 and of the original 3DGS, because a scene ren
 it was trained with. They are compiled into kernels: edit this file to change one, and do not assign to it at run time.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -4,8 +4,6 @@ Limits of containers are those of control groups (cgroups) of Linux, of version 
 the groups in it.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator

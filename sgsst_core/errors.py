@@ -4,8 +4,6 @@ Every message says what is wrong, where (file, property, view), and what to do a
 `InvalidInputError` into exit code 2 (command line) or problem+json (HTTP) without parsing the text.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -4,8 +4,6 @@ Ranks do not authenticate each other, so messages are never unpickled. Decoding 
 and dataclasses and errors of this project; it runs no code that the sender chooses.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, is_dataclass
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Orbit cameras around a scene without cameras: its subject, its up direction, and rings of views that fit it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

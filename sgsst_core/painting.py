@@ -18,8 +18,6 @@ clusters of colors, blended smoothly. It carries night, or another hue of all bl
 and color change beyond this map is local, such as a stroke: it is added, and fades with the distance to them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Progress of a job as it is reported, stored, sent and shown; decisions of its plan; texts about both."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Sequence

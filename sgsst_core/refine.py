@@ -26,8 +26,6 @@ A Gaussian has a single color per viewing direction, so strokes cannot be finer 
 large in the views are split if the gradient of the loss asks for different colors within them.
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, replace
 

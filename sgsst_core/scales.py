@@ -5,8 +5,6 @@ Scales of weight 0 are not computed. Losses differ between views, so they are co
 of whole rounds; every round visits each view once. This module imports no PyTorch: the service estimates jobs with it.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Files derived from scenes, for the command line and, confined, for the service: scenes, blends, pages, videos."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import html

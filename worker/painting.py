@@ -1,7 +1,5 @@
 """Painted views of a scene: an image to paint on, and the job by which the scene follows what was painted."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace

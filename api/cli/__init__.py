@@ -1,6 +1,4 @@
 """The `sgsst` command. This module imports nothing: Ctrl-C may arrive while the command's imports run."""
 
-from __future__ import annotations
-
 #: Exit code after Ctrl-C, as in shells, and what is printed then.
 INTERRUPTED, ABORTED = 130, "Aborted. Output files are complete or were not written."

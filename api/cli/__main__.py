@@ -1,7 +1,5 @@
 """Entry point of the `sgsst` command and of `python -m api.cli`."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import sys

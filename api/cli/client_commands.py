@@ -1,7 +1,5 @@
 """Client commands: `submit`, `status`, `watch`, `download` and others. They do not import PyTorch."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from datetime import datetime

@@ -1,7 +1,5 @@
 """Consoles of the command line, what is printed there by several commands, and exit codes."""
 
-from __future__ import annotations
-
 import os
 import signal
 import stat

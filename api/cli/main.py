@@ -1,7 +1,5 @@
 """The `sgsst` command: its commands by group, and messages for expected errors."""
 
-from __future__ import annotations
-
 import io
 import json
 import sys

@@ -3,8 +3,6 @@
 The SDK evaluates the annotations of the tools, so that all of their names are imported when the module is loaded.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile

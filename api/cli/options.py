@@ -1,7 +1,5 @@
 """Arguments and options of commands, from declarations of their own or the fields of a class."""
 
-from __future__ import annotations
-
 import inspect
 import itertools
 from collections.abc import Callable, Collection, Mapping

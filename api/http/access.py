@@ -2,8 +2,6 @@
 links to a result, `/v1/jobs/{id}/shares`, which anyone who has one can read at `/v1/shared/{token}`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import html

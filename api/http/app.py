@@ -3,8 +3,6 @@
 The process that serves it never imports Ray or PyTorch.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import secrets

@@ -1,7 +1,5 @@
 """`/livez`, `/readyz`, `/metrics`, `/v1/usage`: health checks that return even if one hangs, metrics, usage of keys."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 import shutil

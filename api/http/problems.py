@@ -4,8 +4,6 @@ The OpenAPI document gets what route types do not cover: headers of responses, a
 bodies are defined with their models (`api.http.schemas`, `api.http.submission`, `service.inputs`).
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import logging

@@ -7,8 +7,6 @@ The servers of inputs by URL are not trusted, and neither are the URLs. Every ho
 first one, and is connected to by an address that was checked (`service.outgoing`).
 """
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import json

@@ -4,8 +4,6 @@ Addresses are below the subpath at which a reverse proxy offers the service. The
 a setting, or what a trusted proxy has sent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextvars import ContextVar
 from datetime import UTC, date, datetime

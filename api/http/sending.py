@@ -8,8 +8,6 @@ loads modules of the same version. All URLs in pages and modules are relative, s
 below any path.
 """
 
-from __future__ import annotations
-
 import asyncio
 import gzip
 import hashlib

@@ -3,8 +3,6 @@
 uvicorn's own protocol bounds neither.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

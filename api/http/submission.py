@@ -4,8 +4,6 @@ planned, after all its files have been read and checked.
 Uploads follow the tus protocol 1.0 (https://tus.io/protocols/resumable-upload).
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import hashlib

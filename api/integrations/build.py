@@ -3,8 +3,6 @@
 python api/integrations/build.py FOLDER
 """
 
-from __future__ import annotations
-
 import sys
 import zipfile
 from pathlib import Path

@@ -2,8 +2,6 @@
 Python's standard library.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import http.client

@@ -7,8 +7,6 @@ the benchmark but says nothing about speed. Results are written to benchmarks/re
 is 1 if a part has failed.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib

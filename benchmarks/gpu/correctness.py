@@ -4,8 +4,6 @@ NCCL does not support two ranks on one GPU, so theirs exchange tensors by gloo. 
 the same job on the CPU, a separate process in which no GPU is visible; both run at the same time.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

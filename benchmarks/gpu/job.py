@@ -1,7 +1,5 @@
 """Whole jobs as a user runs them: `sgsst stylize` as a process, with its seconds by part and the plan's prediction."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

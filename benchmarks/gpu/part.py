@@ -1,7 +1,5 @@
 """Sizes and findings of the benchmark's parts, and what they measure with."""
 
-from __future__ import annotations
-
 import json
 import math
 import statistics

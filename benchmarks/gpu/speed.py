@@ -1,7 +1,5 @@
 """Time and memory of SOS steps, by part and kernel and beside the plan, and time of the rasterizer."""
 
-from __future__ import annotations
-
 import statistics
 
 import torch

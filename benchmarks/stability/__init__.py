@@ -4,8 +4,6 @@ Each case describes its extreme input, measures an error against a float64 refer
 If the input must be rejected, the case checks that it is.
 """
 
-from __future__ import annotations
-
 from benchmarks.stability import format_cases as formats
 from benchmarks.stability import gaussian_cases as gaussians
 from benchmarks.stability import image_cases as images

@@ -8,8 +8,6 @@ Each case is printed with its error and bound; the exit status is 1 if a case ex
 The search runs random jobs and prints those that exceed theirs; the figure shows ten cases as images.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

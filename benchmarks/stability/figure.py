@@ -3,8 +3,6 @@
 Each function computes one case, with the published formula in a few lines. Values that are not finite are magenta.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Hard cases of compressed scene files and camera orbits: one Gaussian, extreme sizes, objects without extent."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Hard cases of extreme Gaussians, mixed with ordinary Gaussians whose pixels must stay correct."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Hard cases of style and content: images without texture or with extreme values, and constant features."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

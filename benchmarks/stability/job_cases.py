@@ -5,8 +5,6 @@ no step exceeds Adam's maximum, a repeated run is bit-identical, the loss of all
 gradient of the final image match float64.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import math

@@ -1,7 +1,5 @@
 """Hard cases of the optimizer: gradients of all magnitudes, too large or too many steps, colors out of range."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Callable

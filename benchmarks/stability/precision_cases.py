@@ -1,7 +1,5 @@
 """Hard cases of precision: long sums, and the order of summation over partition tiles."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import reduce

@@ -4,8 +4,6 @@ Each number defines a job (`drawn`). The job may be refused with one of the proj
 stay within the bounds of `job_cases.strain`. Each failure that was found stays as a hard case here.
 """
 
-from __future__ import annotations
-
 import math
 import random
 import sys

@@ -1,7 +1,5 @@
 """Float64 reference of `loss.sos.SosLoss`: the loss and all its terms by their definition, untiled, with autograd."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Hard cases of views: sizes, fields of view, and views that see nothing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

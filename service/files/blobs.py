@@ -4,8 +4,6 @@ If the file store is a local folder, inputs are files in the data folder (`BlobF
 the file store, which all hosts share, and are read through a cache on this host (`StoredBlobs`).
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import hashlib

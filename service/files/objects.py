@@ -4,8 +4,6 @@ Objects are written as a whole, and overwritten only to repair them. Failures of
 broken) are raised as `StoreError`; errors of a local folder are raised unchanged.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

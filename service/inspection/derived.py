@@ -4,8 +4,6 @@
 never reads a scene.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Mapping

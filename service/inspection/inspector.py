@@ -1,7 +1,5 @@
 """Client of `service.inspection.process`: checks users' files without reading them in the calling process."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import json

@@ -7,8 +7,6 @@ responses are lines of JSON on stdin and stdout, one request at a time. The fina
 preceded by lines of progress, `{"planning": ...}`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

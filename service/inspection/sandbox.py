@@ -4,8 +4,6 @@ Linux only, with two kernel features that need no privileges. Landlock (5.13 or 
 restricts everything else: network, other processes, attributes of files, and parts of the kernel that no reader needs.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import os

@@ -5,8 +5,6 @@ come from such a machine itself: the environment of its Ray node defines the dat
 cache, and the credentials of the store.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import logging

@@ -1,7 +1,5 @@
 """Supervision of one attempt by the dispatcher: its folder, its process, its reports, and its ending."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math

@@ -5,8 +5,6 @@ dies loses its leases. The process of an attempt with more than one rank starts 
 with that process. Neither a job nor Ray can therefore crash the dispatcher.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

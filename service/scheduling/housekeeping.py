@@ -5,8 +5,6 @@ another file after the job had already ended elsewhere, and from processes that 
 running.
 """
 
-from __future__ import annotations
-
 import secrets
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence

@@ -4,8 +4,6 @@ Receivers are not trusted. Each message is sent over its own connection, to a ve
 everything from the name lookup to the head of the response, and only the status of the response is read.
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import hashlib

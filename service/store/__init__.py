@@ -1,7 +1,5 @@
 """Durable store of jobs, inputs and keys, in SQLite or PostgreSQL with the same code."""
 
-from __future__ import annotations
-
 from service.deadlines import until_answered
 from service.settings import ServiceSettings
 from service.store.database import ANSWER_SECONDS, Clock, Database

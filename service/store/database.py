@@ -1,7 +1,5 @@
 """Common access to SQLite and PostgreSQL: engine, transactions, migrations, and errors that are no bugs."""
 
-from __future__ import annotations
-
 import fcntl
 import logging
 import math

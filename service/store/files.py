@@ -1,7 +1,5 @@
 """Rows of blobs, uploads and inspections; their files are managed by `service.files.blobs`."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from typing import Any

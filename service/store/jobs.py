@@ -8,8 +8,6 @@ The loss history is thinned as it is written: a point is stored when the job's r
 since the previous one, so points are evenly spaced on the logarithmic time axis of loss charts (784 for 25 hours).
 """
 
-from __future__ import annotations
-
 import hmac
 import json
 import re

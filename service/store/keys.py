@@ -3,8 +3,6 @@
 A browser that has sent a key once need not send it again. Only the SHA-256 of each secret is stored.
 """
 
-from __future__ import annotations
-
 import hashlib
 import secrets
 from collections.abc import Mapping

@@ -12,8 +12,6 @@ Only the job's own failures count against it. An attempt that a machine, the net
 store has ended is repeated until it succeeds.
 """
 
-from __future__ import annotations
-
 import base64
 import secrets
 from collections import Counter

@@ -1,7 +1,5 @@
 """Tables of the store; times are seconds since 1970 (UTC), and ids sort by creation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, MetaData, String, Text, text

@@ -4,8 +4,6 @@
 first job on a machine compiles them, and so does each of the service's confined processes, which cannot write there.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

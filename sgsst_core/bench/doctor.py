@@ -5,8 +5,6 @@
 prints one finding per line as JSON, as soon as it is known.
 """
 
-from __future__ import annotations
-
 import json
 import queue
 import subprocess

@@ -21,8 +21,6 @@ make them faster. Results differ from those of a direct convolution by rounding.
 # Arguments of kernels are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

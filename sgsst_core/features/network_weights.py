@@ -6,8 +6,6 @@ The common format is a dict of float32 tensors: "conv1_1.weight" [out, in, 3, 3]
 input_scale + input_shift, and features have the units of a 0-255 input.
 """
 
-from __future__ import annotations
-
 import hashlib
 import http.client
 import io

@@ -11,8 +11,6 @@ channels to eight and copy the pixels; these kernels read pixels and write featu
 # Arguments are untyped: Triton compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

@@ -12,8 +12,6 @@ its factor to the previous layer's, and its biases by its own factor, scales its
 factor for `PIXELS` adds the pixels themselves to the comparison, which the paper does not do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace

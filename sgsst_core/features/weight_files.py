@@ -1,7 +1,5 @@
 """Folder, paths and verification of installed network weights. Does not import PyTorch."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Files of known kinds that are no readable scenes or cameras: what each is, and what to do. Imports no PyTorch."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Atomic writing of output files, and their digests."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

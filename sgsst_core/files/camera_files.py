@@ -6,8 +6,6 @@ camera with lens distortion is the pinhole with the same focal lengths and princ
 panorama becomes the cameras of its cube faces.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import ChainMap

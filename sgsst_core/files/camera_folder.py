@@ -5,8 +5,6 @@ read, which contain everything that a view needs: COLMAP writes the pose of each
 `frames` also determine it. `points3D`, `rigs` and `frames` are never opened.
 """
 
-from __future__ import annotations
-
 import codecs
 import json
 import mmap

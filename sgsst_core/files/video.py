@@ -1,7 +1,5 @@
 """Writing of videos: MP4 with H.264, WebM with VP9 and optional alpha channel, and sequences of PNG images."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import tempfile

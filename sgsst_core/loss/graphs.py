@@ -4,8 +4,6 @@ For small views, the GPU would be idle between separate kernel launches. A graph
 addresses, so inputs that differ between views are first copied to these addresses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

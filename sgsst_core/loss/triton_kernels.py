@@ -4,8 +4,6 @@ Those of the content term read every feature once, where PyTorch would store sev
 features. All kernels also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import).
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

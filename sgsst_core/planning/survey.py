@@ -5,8 +5,6 @@ are distributed among ranks. The thresholds of the checks separate real captures
 (`benchmarks/results/README.md`).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence

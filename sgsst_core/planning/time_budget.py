@@ -4,8 +4,6 @@ Views are as large as lets enough steps fit (`_ENOUGH`): at equal time, that lea
 smaller views. What is chosen here starts the job; its own pace then decides the number of steps (`stylizing.loop`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

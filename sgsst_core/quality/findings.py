@@ -4,8 +4,6 @@ Each finding has a count, the worst case, and its consequence or remedy. Finding
 reject unusable input.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

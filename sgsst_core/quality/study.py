@@ -4,8 +4,6 @@ The page shows the style and, at one view after another, the renders of all vari
 neither names nor files of the variants, only random tokens; a key file beside it maps tokens to variants.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import random

@@ -3,8 +3,6 @@
 To add one, implement `base.Rasterizer` in a module and list the class in `RASTERIZERS`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

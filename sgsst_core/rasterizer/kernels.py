@@ -20,8 +20,6 @@ bounds are not checked.
 # Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -24,8 +24,6 @@ most 2^-11.
 # Arguments are untyped: Triton compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

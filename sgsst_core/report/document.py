@@ -1,7 +1,5 @@
 """JSON document of a report: inputs, plan, results and history of a job."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

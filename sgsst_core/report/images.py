@@ -1,7 +1,5 @@
 """Images of reports in their colors: contact sheets as JPEG, and the frames of videos."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field

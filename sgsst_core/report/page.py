@@ -1,7 +1,5 @@
 """HTML page of a report: one self-contained file with tables and a chart of the loss, which is written as a PNG too."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

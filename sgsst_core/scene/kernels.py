@@ -7,8 +7,6 @@ accurate to only six digits.
 # Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

@@ -7,8 +7,6 @@ the colors of a view cost one multiply-add and a clamp. Functions operate on pla
 arguments. The sum also has compiled versions: Numba on the CPU, Triton on a GPU.
 """
 
-from __future__ import annotations
-
 import functools
 
 import torch

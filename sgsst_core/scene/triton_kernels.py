@@ -8,8 +8,6 @@ float32, like the colors that they are added to.
 # Arguments are untyped: Triton compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

@@ -3,8 +3,6 @@
 A checkpoint contains a digest of its content.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json

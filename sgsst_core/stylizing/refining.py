@@ -6,8 +6,6 @@ the style's mean and covariance in closed form. The first steps would reach such
 gradient shows where texture is needed.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

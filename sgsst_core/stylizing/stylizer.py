@@ -4,8 +4,6 @@ Each call of `Stylizer.run_step` makes one step; `loop.run` makes all steps. On 
 after it has queued the next one, so that the GPU does not wait for the host.
 """
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence

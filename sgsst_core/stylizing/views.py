@@ -1,7 +1,5 @@
 """Views of a job: colors, images, color gradients, and targets, prepared when a view first needs them."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 from collections.abc import Callable, Sequence

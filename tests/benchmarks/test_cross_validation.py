@@ -1,7 +1,5 @@
 """Tests of the cross-validation of defaults: what a choice sees, a run, and that the document shows stored results."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tests of the comparison of schedules at equal cost."""
 
-from __future__ import annotations
-
 from benchmarks.equal_steps import Pace, seconds_of, steps_as_long_as
 
 

@@ -1,7 +1,5 @@
 """Tests of `python -m benchmarks.gpu` at small sizes: all parts run, and the results have the expected fields."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Tests of the comparison of methods: a small run, and that the document shows stored results."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

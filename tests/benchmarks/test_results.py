@@ -1,7 +1,5 @@
 """Tests of the stored results: each says what it was measured with, and documents state what it says."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Shared check of the tests that run the hard cases of `make stability`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

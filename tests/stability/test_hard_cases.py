@@ -1,7 +1,5 @@
 """Tests of the hard cases of `make stability` on CPUs: their small versions stay within their bounds."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ The interpreter is about a thousand times slower than a GPU. Cases have fewer Ga
 than the kernels prepare at once; `make stability` runs them at full size on a GPU.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

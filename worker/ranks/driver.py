@@ -9,8 +9,6 @@ failure, the next attempt resumes the job with as many ranks as the cluster has 
 a row make no progress.
 """
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import time

@@ -8,8 +8,6 @@ The order of a sum depends only on the number of ranks and the size of the tenso
 same bits, and repeated runs are bit-identical.
 """
 
-from __future__ import annotations
-
 import os
 import socket
 from collections import Counter

@@ -1,7 +1,5 @@
 """Nodes of ComfyUI: stylize a Gaussian splat on a service of sgsst, and blend two."""
 
-from __future__ import annotations
-
 import io
 import tempfile
 from pathlib import Path

@@ -3,8 +3,6 @@
 Its panel: choose a painting, watch the colors in the open scene, compare and undo.
 """
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Alembic environment: runs the migrations on the connection passed by `Database.upgrade`."""
 
-from __future__ import annotations
-
 from alembic import context
 
 from service.store.tables import Base

@@ -4,8 +4,6 @@ To add a format, write a module with a `SceneFormat`, and append it to `FORMATS`
 API process reads headers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal

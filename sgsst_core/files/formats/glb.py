@@ -14,8 +14,6 @@ Linear colors are converted to sRGB for each Gaussian.
 The specification does not define antialiasing. Written files state the render mode in the `extras` of the primitive.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import struct

@@ -10,8 +10,6 @@ degree 0 to 2, one band after the other, channel-major in each. Axes are those o
 https://github.com/mkkellogg/GaussianSplats3D.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import dataclass

@@ -16,8 +16,6 @@ A flag states that a scene was trained antialiased. Spark sets it for all scenes
 extension records and with the fractional bits of the format's library, so the flag counts in other files only.
 """
 
-from __future__ import annotations
-
 import itertools
 import struct
 import zlib

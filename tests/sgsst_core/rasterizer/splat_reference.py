@@ -3,8 +3,6 @@
 The fast rasterizers are tested against it. It is not in `RASTERIZERS`.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass

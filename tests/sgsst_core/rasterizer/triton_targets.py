@@ -8,8 +8,6 @@ output, and the instructions that the compositing kernels execute for each pixel
 from NVIDIA's disassembler.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

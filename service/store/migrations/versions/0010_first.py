@@ -1,7 +1,5 @@
 """Tables of the first version, which new databases get from `service.store.tables` instead."""
 
-from __future__ import annotations
-
 revision = "0010"
 down_revision = None
 

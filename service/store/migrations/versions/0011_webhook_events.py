@@ -1,7 +1,5 @@
 """Events of a job about which its webhook gets messages."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

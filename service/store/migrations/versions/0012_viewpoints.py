@@ -1,7 +1,5 @@
 """Viewpoints of the page that shows a result."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

@@ -1,7 +1,5 @@
 """Further usage of keys, and keys of operators."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 
