@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
@@ -142,6 +143,7 @@ def merged(errors: Iterable[ErrorDetails]) -> list[ErrorDetails]:
     return list(by_loc.values())
 
 
+@cache
 def declared(model: type[BaseModel]) -> dict[str, Declared]:
     """Return the fields of a model that are options, keyed by the name shown to users."""
     options = [
@@ -589,6 +591,8 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
     chosen = {shown[name].field if name in shown else name: each for name, each in values.items() if each is not None}
     if "learning_rate" in chosen:  # an explicit learning rate is constant, unless its end is given too
         chosen.setdefault("learning_rate_end", chosen["learning_rate"])
+    if "within" in chosen:  # the given time is used as long as steps are left
+        chosen.setdefault("early_stop", False)
     chosen.setdefault("fixed", tuple(name for name in _CHOSEN if name in chosen))
     whole = _PRESETS[preset]
     settings = checked(Settings, {"preset": preset, **whole, **chosen})

@@ -17,6 +17,7 @@ from sgsst_core.planning.time_budget import LONGER
 from sgsst_core.progress import duration, percent
 from sgsst_core.quality.findings import Finding
 from sgsst_core.scales import ScaleWeights, predicted_fall, ratio, smoothed
+from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import versions
 from sgsst_core.stylizing.job import StylizationJob, estimate
 from sgsst_core.stylizing.loop import Stopped
@@ -203,11 +204,12 @@ def plan_json(job: StylizationJob) -> dict[str, Any]:
 
 def repeating_options(stylizer: Stylizer) -> str | None:
     """Return the options that repeat a job with a time budget exactly, instead of `--within`; None without one."""
-    choice, coarse = stylizer.job.plan.time_choice, stylizer.job.plan.steps_coarse
+    choice, coarse, settings = stylizer.job.plan.time_choice, stylizer.job.plan.steps_coarse, stylizer.job.settings
     if choice is None:
         return None
     steps = f"--steps-coarse {min(coarse, stylizer.step)} --steps-sos {max(stylizer.step - coarse, 0)}"
-    return f"--resolution {stylizer.job.settings.max_resolution} --views {len(choice.views)} {steps}"
+    stop = "" if settings.early_stop == make_settings(settings.preset).early_stop else " --no-early-stop"
+    return f"--resolution {settings.max_resolution} --views {len(choice.views)} {steps}{stop}"
 
 
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:

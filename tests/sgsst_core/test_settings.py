@@ -24,6 +24,12 @@ def test_values_override_the_preset_unless_none() -> None:
     assert settings.max_resolution == 640
 
 
+def test_time_budget_does_not_stop_early_unless_asked_to() -> None:
+    assert make_settings("standard").early_stop
+    assert not make_settings("standard", within=60).early_stop
+    assert make_settings("standard", within=60, early_stop=True).early_stop
+
+
 def test_explicit_learning_rate_is_constant_without_an_end() -> None:
     assert make_settings("standard", learning_rate=0.2).learning_rate_end == 0.2
 

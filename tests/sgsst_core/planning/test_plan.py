@@ -514,7 +514,7 @@ def test_printed_options_repeat_a_steered_job_bit_for_bit(
 ) -> None:
     """There is time for more steps than the five that were chosen, until there have been enough of them."""
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path))
-    scene, views, settings = wall(10, 8), cameras(4, 32, 24), make_settings(preset, within=1e6, early_stop=False)
+    scene, views, settings = wall(10, 8), cameras(4, 32, 24), make_settings(preset, within=1e6)
     steered = Stylizer.planned(scene, views, style(), settings, weights=tiny_weights, left=lambda: 1e6)
     steered.job = replace(steered.job, settings=steered.job.settings.with_steps(0, 5))
     assert run(steered, Callbacks(left=lambda: 1e6 if steered.step < enough else 0.0)) == "within"
@@ -522,10 +522,10 @@ def test_printed_options_repeat_a_steered_job_bit_for_bit(
     assert (steered.job.total_steps == enough) == (enough in (4, 9)), "steered to what has been done"
     options = repeating_options(steered)
     assert options is not None
-    words = options.split()
+    words, flag = options.removesuffix(" --no-early-stop").split(), options.endswith(" --no-early-stop")
     given = {name[2:].replace("-", "_"): value for name, value in zip(words[::2], words[1::2], strict=True)}
     some = spread(views, int(given.pop("views")))
-    own: dict[str, Any] = {"early_stop": False, **{name: int(value) for name, value in given.items()}}
+    own: dict[str, Any] = {"early_stop": False if flag else None, **{name: int(given[name]) for name in given}}
     again = Stylizer.planned(scene, some, style(), make_settings(preset, **own), weights=tiny_weights)
     assert repeating_options(again) is None
     assert (run(again), again.step) == ("finished", enough)
