@@ -765,7 +765,9 @@ async def _adopt_results(context: Context, caller: Caller, received: Received, r
     Raises:
         UNKNOWN_INPUT: If a job does not exist, or has no result.
     """
-    results = await asyncio.to_thread(_referred_results, context, caller, received)
+    results = {}
+    if any(_RESULT_PATH.fullmatch(text.removeprefix(subpath.get())) for *_, text in received.uploads):
+        results = await asyncio.to_thread(_referred_results, context, caller, received)
     run = partial(context.threads.run, caller.owner, _adopt_result, context, receipt)
     return {path: await run(row, size=row.size) for path, row in results.items()}
 

@@ -8,11 +8,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, text
+from sqlalchemy import Connection, Engine, Table, create_engine, event, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError, InterfaceError, NoResultFound, OperationalError
@@ -363,9 +363,8 @@ def idempotency_row(session: Session, owner: str, key: str, fingerprint: str, no
 
 def count(session: Session, name: str, labels: str = "", amount: float = 1.0) -> None:
     """Add to a counter within the caller's transaction."""
-    insert = upsert(session)(_COUNTERS).values(name=name, labels=labels, value=amount)
-    added = {"value": _COUNTERS.c.value + insert.excluded.value}
-    session.execute(insert.on_conflict_do_update(index_elements=["name", "labels"], set_=added))
+    adding = addition(_COUNTERS, ("name", "labels"), session.get_bind().dialect.name)
+    session.execute(adding, {"name": name, "labels": labels, "value": amount})
 
 
 def observe(session: Session, name: str, seconds: float) -> None:
@@ -381,6 +380,20 @@ def observe(session: Session, name: str, seconds: float) -> None:
         count(session, f"{name}_bucket", f'le="{bound}"')
 
 
+@cache
+def addition(table: Table, keys: tuple[str, ...], dialect: str) -> Any:
+    """Return the statement that adds to all other columns of the row with these keys, which it inserts if needed.
+
+    It is built once, because building it takes longer than running it.
+    """
+    insert = _INSERTS[dialect](table)
+    added = {each.name: each + insert.excluded[each.name] for each in table.c if each.name not in keys}
+    return insert.on_conflict_do_update(index_elements=keys, set_=added)
+
+
 def upsert(session: Session) -> Any:
     """Return the `insert` construct with ON CONFLICT for the session's database."""
-    return sqlite.insert if session.get_bind().dialect.name == "sqlite" else postgresql.insert
+    return _INSERTS[session.get_bind().dialect.name]
+
+
+_INSERTS: dict[str, Any] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}

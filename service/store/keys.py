@@ -8,6 +8,7 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import date, timedelta
+from functools import cache
 from typing import Any, Self
 
 from sqlalchemy import BindParameter, String, bindparam, delete, func, or_, select, text, union
@@ -15,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from service import problems
 from service.settings import ServiceSettings
-from service.store.database import Database, new_id, upsert
+from service.store.database import Database, addition, new_id
 from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, JobRow, KeyRow, SessionRow, UploadRow, UsageRow
 
 _DAY = 86_400
@@ -88,11 +89,14 @@ def lock_owner(session: Session, owner: str) -> None:
 def add_usage(session: Session, owner: str, now: float, **amounts: float) -> tuple[int, float]:
     """Add amounts to an owner's usage of the day, by column; return its jobs and GPU seconds of the day."""
     zeros = dict.fromkeys(("jobs", "gpu_seconds", "cpu_seconds", "bytes"), 0)
-    insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), **(zeros | amounts))
-    added = {name: _USAGE.c[name] + insert.excluded[name] for name in amounts}
-    counted = insert.on_conflict_do_update(index_elements=["owner", "day"], set_=added)
-    jobs, seconds = session.execute(counted.returning(_USAGE.c.jobs, _USAGE.c.gpu_seconds)).one()
+    values = {"owner": owner, "day": day_of(now), **zeros, **amounts}
+    jobs, seconds = session.execute(_adding_usage(session.get_bind().dialect.name), values).one()
     return jobs, seconds
+
+
+@cache
+def _adding_usage(dialect: str) -> Any:
+    return addition(_USAGE, ("owner", "day"), dialect).returning(_USAGE.c.jobs, _USAGE.c.gpu_seconds)
 
 
 def count_job(session: Session, owner: str, quotas: Quotas, now: float, size: int = 0) -> None:
