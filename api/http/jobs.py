@@ -11,7 +11,7 @@ import hashlib
 import json
 import logging
 import re
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import PurePosixPath
@@ -73,16 +73,32 @@ HEARTBEAT_SECONDS = 15.0
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class _Sent:
+    """Event as it is sent.
+
+    Attributes:
+        ends: Whether the job has ended with it.
+    """
+
+    id: int
+    text: bytes
+    ends: bool
+
+
 @dataclass
 class _Watched:
     """Job with watchers.
 
     Attributes:
         newest: Number of its newest event at the last poll; 0 before the first one, None if the job was deleted.
+        latest: Events that the last poll has found, which all watchers share; all after number `since`, if not None.
         changed: Event that is set when there are newer events, and then replaced.
     """
 
     newest: int | None = 0
+    latest: Sequence[_Sent] = ()
+    since: int | None = None
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     watchers: int = 0
 
@@ -130,11 +146,11 @@ class Hub:
             yield b"retry: 2000\n\n"
             while not self._closing and watched.newest is not None:
                 changed = watched.changed
-                rows = await self._events_after(job_id, after)
-                for row in rows:
-                    yield _text(row)
-                    after, ended = row.id, _ends(row)
-                if rows:
+                events = await self._events_after(job_id, watched, after)
+                for event in events:
+                    yield event.text
+                    after, ended = event.id, event.ends
+                if events:
                     continue
                 if ended:
                     return
@@ -147,11 +163,13 @@ class Hub:
             if not watched.watchers:
                 self._watched.pop(job_id, None)
 
-    async def _events_after(self, job_id: str, after: int) -> list[EventRow]:
+    async def _events_after(self, job_id: str, watched: _Watched, after: int) -> list[_Sent]:
+        if watched.since is not None and after >= watched.since:
+            return [event for event in watched.latest if event.id > after]
         try:
-            return await asyncio.to_thread(self._store.jobs.events, job_id, after)
+            return [_sent(row) for row in await asyncio.to_thread(self._store.jobs.events, job_id, after)]
         except DatabaseUnavailableError:  # The stream waits until the database is back, and the next poll wakes it.
-            self._watched[job_id].newest = 0
+            watched.newest = 0
             return []
 
     async def _poll(self) -> None:
@@ -174,18 +192,22 @@ class Hub:
         watched = dict(self._watched)
         newest = await asyncio.to_thread(self._store.jobs.last_events, list(watched))
         for job_id, each in watched.items():
-            if each.newest != newest.get(job_id):
-                each.newest = newest.get(job_id)
-                changed, each.changed = each.changed, asyncio.Event()
-                changed.set()
+            known, number = each.newest, newest.get(job_id)
+            if number == known:
+                continue
+            rows = await asyncio.to_thread(self._store.jobs.events, job_id, known) if number and known else []
+            each.newest, each.since = rows[-1].id if rows else number, known if rows else None
+            each.latest = [_sent(row) for row in rows]
+            changed, each.changed = each.changed, asyncio.Event()
+            changed.set()
 
 
-def _text(row: EventRow) -> bytes:
-    """Return an event as it is sent."""
+def _sent(row: EventRow) -> _Sent:
     data = row.data
     if row.kind == "progress":  # same format as in responses that show the job
         data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
-    return f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n".encode()
+    text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
+    return _Sent(row.id, text.encode(), _ends(row))
 
 
 def _ends(row: EventRow) -> bool:
