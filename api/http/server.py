@@ -5,6 +5,7 @@ uvicorn's own protocol bounds neither.
 
 import asyncio
 import contextlib
+import contextvars
 import logging
 import os
 import resource
@@ -201,7 +202,8 @@ class Connection(HttpToolsProtocol):
 
     def on_response_complete(self) -> None:
         """Finish a response, and limit the time for the rest of a body that the app did not read."""
-        super().on_response_complete()
+        # An empty context: the timer of the idle connection, or a pipelined request, would keep that of this request.
+        contextvars.Context().run(super().on_response_complete)
         self._forget_answered()
 
     def _forget_answered(self) -> None:
