@@ -15,7 +15,7 @@ import multiprocessing
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ ATTACKS: dict[str, Costly] = {
 def attack(url: str, key: str, name: str, files: Files, statuses: Any) -> None:
     """Send requests of one kind until the process is killed, and count response statuses."""
 
-    async def one(client: httpx2.AsyncClient, numbers: itertools.count[int]) -> None:
+    async def one(client: httpx2.AsyncClient, numbers: Iterator[int]) -> None:
         while True:
             try:
                 status = str((await ATTACKS[name](client, files, next(numbers))).status_code)

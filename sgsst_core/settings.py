@@ -484,7 +484,10 @@ class Settings(BaseModel):
         description="Project colors to 0..1, the displayable range, after each step, and to the line or plane in RGB "
         "that contains the style's colors, if there is one (black and white, few hues).",
     )
-    early_stop: bool = Field(False, description="Stop when the smoothed loss of all scales no longer falls.")
+    early_stop: bool = Field(
+        False,
+        description="Stop when the smoothed loss of all scales no longer falls. With within, the default is off.",
+    )
     target_loss: Annotated[float | None, Option(unit="fraction of the initial loss", metavar="R", default="never")] = (
         Field(
             None,

@@ -472,7 +472,8 @@ def video_cameras(
         even: Whether sides must be even.
 
     Raises:
-        SettingsError: If there are no cameras, or an option of the turntable is out of range.
+        CameraError: If there are no cameras to lead through.
+        SettingsError: If an option of the turntable is out of range.
     """
     if through is not None:
         ahead = [camera for camera in through if camera.name == f"{camera.panorama}.front" or camera.panorama is None]

@@ -196,7 +196,8 @@ class DerivedFiles:
         else:
             await self.poster(job, chosen["start"], quotas)
         unused = await asyncio.to_thread(self._store.jobs.set_viewpoints, job.id, chosen, outdated)
-        await self._threads.run(job.owner, self._artifacts.objects.discard, unused)
+        if unused:
+            await self._threads.run(job.owner, self._artifacts.objects.discard, unused)
 
     async def video(self, job: JobRow, options: JobVideo, quotas: Quotas, show: Show = lambda now: None) -> ArtifactRow:
         """Render a video of a job's result, which replaces an earlier one, and return it.

@@ -5,6 +5,7 @@ another file after the job had already ended elsewhere, and from processes that 
 running.
 """
 
+import math
 import secrets
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -73,11 +74,12 @@ def _strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
         job = store.jobs.get(job_id, None)
     except NotFoundError:
         return names
-    # the running attempt may still write rows; earlier ones cannot. Files derived from a result have the next epoch.
-    return _strays(store, job_id, names, job.lease_epoch + (-1 if job.status in UNFINISHED else 1))
+    # the running attempt may still write rows; earlier ones cannot. An older copy of the database does not know the
+    # latest epochs of an ended job.
+    return _strays(store, job_id, names, job.lease_epoch - 1 if job.status in UNFINISHED else math.inf)
 
 
-def _strays(store: Store, job_id: str, names: Iterable[str], epoch: int) -> list[str]:
+def _strays(store: Store, job_id: str, names: Iterable[str], epoch: float) -> list[str]:
     """Return the files of a job that no database row refers to, except those of later leases than `epoch`."""
     known = {row.location for row in store.jobs.artifacts(job_id)}
     return [name for name in names if name not in known and int(name.split("/")[1]) <= epoch]

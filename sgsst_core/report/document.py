@@ -208,7 +208,7 @@ def repeating_options(stylizer: Stylizer) -> str | None:
     if choice is None:
         return None
     steps = f"--steps-coarse {min(coarse, stylizer.step)} --steps-sos {max(stylizer.step - coarse, 0)}"
-    stop = "" if settings.early_stop == make_settings(settings.preset).early_stop else " --no-early-stop"
+    stop = " --no-early-stop" if make_settings(settings.preset).early_stop and not settings.early_stop else ""
     return f"--resolution {settings.max_resolution} --views {len(choice.views)} {steps}{stop}"
 
 

@@ -427,8 +427,9 @@ def table() -> Scene:
     return joined(ground(4.0), scene_of(box((-0.5, -0.5, -0.5), (0.5, 0.0, 0.5))))
 
 
-def test_scene_with_ground_gets_views_from_above_and_none_from_below() -> None:
-    orbit = make_orbit(table(), OrbitRequest(count=24))
+@pytest.mark.parametrize("up", [None, UP])
+def test_scene_with_ground_gets_views_from_above_and_none_from_below(up: tuple[float, float, float] | None) -> None:
+    orbit = make_orbit(table(), OrbitRequest(count=24, up=up))
     assert orbit.up.ground
     assert orbit.elevations == (10, 70)
     assert len(orbit.cameras) == 24

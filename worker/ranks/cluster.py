@@ -187,7 +187,7 @@ def _silence_ray() -> None:
 
 #: Seconds to wait for resources in use. Those of lost ranks are soon free again.
 PLACE_SECONDS = 5
-#: Seconds after which the number of ranks to reserve resources for is halved instead of reduced by one.
+#: Seconds after which the number of ranks to reserve resources for is reduced by an eighth instead of one.
 _SHORTEN_SECONDS = 10
 
 
@@ -272,8 +272,8 @@ def reserve(workers: int, scene: int = 0) -> Reservation:
         if threads > 1 and not gpus:  # other jobs may use some of the cores
             threads = 1
         else:
-            wanted = wanted - 1 if time.monotonic() < deadline else wanted // 2
-        patience = max(int(deadline - time.monotonic()) // max(wanted, 1), 1)  # Ray ignores fractions of a second
+            wanted -= 1 if time.monotonic() < deadline else max(wanted // 8, 1)
+        patience = max(int(deadline - time.monotonic()) // max(wanted, 1), 2)  # Ray ignores fractions of a second
     needed = ", ".join(f"{name} {amount:,}" for name, amount in {"CPU": threads, **of_gpu}.items())
     raise NoCapacityError(f"Ray has no capacity for a worker, which needs {needed}")
 

@@ -246,10 +246,11 @@ def test_orphaned_results_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     referenced = put(done.job_id, 1)
     store.leases.succeed(done, [referenced], {})
     late, unknown = put(done.job_id, 1), put("job_0123456789", 1)
+    lost = put(done.job_id, 9)  # its row was in a newer copy of the database
     store.leases.release(running)
     assert helpers.lease(store, "two").epoch == 2
     before, own = put(running.job_id, 1), put(running.job_id, 2)
-    everything = {file.location for file in (referenced, late, unknown, before, own)}
+    everything = {file.location for file in (referenced, late, unknown, lost, before, own)}
     assert set(artifacts.objects.below("")) == everything
     assert list(orphans(store, artifacts, blobs)) == [], "rows may still be on their way"
     monkeypatch.setattr("service.files.objects.ORPHAN_SECONDS", -60.0)
