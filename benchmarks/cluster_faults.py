@@ -56,7 +56,7 @@ from tests.small_scenes import wall, write_files
 PARAMETERS = {"preset": "standard", "steps_coarse": 0, "steps_sos": 150, "backbone": "vgg16", "early_stop": False}
 SEEDS = (1, 2)
 #: Number of unfinished jobs to maintain; every third job runs on two ranks. Number of faults.
-QUEUE, TWO_RANKS_EVERY, FAULTS = 3, 3, 60
+QUEUE, TWO_RANKS_EVERY, FAULTS = 3, 3, 30
 RAY_PORT, PG_PORT, S3_PORT, API_PORT = 6479, 5498, 5599, 8000
 NODES, DISPATCHERS, APIS = ("n1", "n2", "n3"), ("d1", "d2"), ("a1", "a2")
 #: Durations of faults in seconds: network cut (minimum, maximum), S3 outage, slow connection, full disk.
