@@ -5,8 +5,6 @@ lease. It also counts as healthy while the database does not respond, because a 
 jobs.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import urllib.request
@@ -40,7 +38,7 @@ def main() -> int:
     return 2
 
 
-def dispatcher_is_healthy(store: Store) -> bool:
+def dispatcher_is_healthy(store: "Store") -> bool:
     """Return whether a dispatcher of this machine or container has sent a heartbeat lately, or the database is down."""
     from service.problems import DatabaseUnavailableError
     from service.scheduling.capacity import is_of_this_machine

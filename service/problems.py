@@ -4,8 +4,6 @@ Code raises an error by calling its problem: `raise problems.QUEUE_FULL(limit=10
 for errors that some code catches.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,7 +20,7 @@ class ServiceError(SgsstError):
         extra: Additional members of the problem document.
     """
 
-    def __init__(self, problem: ProblemType, message: str, code: str, retry_after: int | None) -> None:
+    def __init__(self, problem: "ProblemType", message: str, code: str, retry_after: int | None) -> None:
         super().__init__(message)
         self.problem, self.code, self.status, self.retry_after = problem, code, problem.status, retry_after
         self.headers: dict[str, str] = {}

@@ -1,7 +1,5 @@
 """Devices: the current one of a thread, waiting for it, and a profiler that uses its stream events, or the clock."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -59,7 +57,7 @@ class Timer:
             self._open.pop()
             self._whole = outer
 
-    def lap(self) -> Timer:
+    def lap(self) -> "Timer":
         """Return a timer that has all measurements so far, to be read later, and continue with none."""
         earlier = Timer(self._device)
         earlier.seconds, earlier._marked = self.seconds, self._marked

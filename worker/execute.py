@@ -4,8 +4,6 @@ Every rank calls the same functions. Until the steps start, nothing is printed, 
 preview.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import secrets
@@ -104,7 +102,7 @@ def prepare(
     resume: Resume | None = None,
     warn: Warn = lambda line: None,
     show_planning: ShowPlanning | None = None,
-    preview: Previews | None = None,
+    preview: "Previews | None" = None,
     plan_file: Path | None = None,
     left: SecondsLeft | None = None,
     start: float = 0.0,
@@ -343,7 +341,7 @@ def execute(
     job: Job,
     listener: Listener,
     *,
-    preview: Previews | None = None,
+    preview: "Previews | None" = None,
     checkpoint_seconds: float = WorkerOptions.checkpoint_seconds,
     run_id: str | None = None,
     left: SecondsLeft | None = None,

@@ -4,8 +4,6 @@ They are dumped once and sent, stored and shown unchanged; `sgsst_core.progress`
 jobs and commands are checked before any work starts. Neither PyTorch nor Ray is imported.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,7 +43,7 @@ class SceneRequest(ViewOptions):
     cameras: Path | None = None
 
     @staticmethod
-    def of(scene: Path, cameras: Path | None, options: ViewOptions) -> SceneRequest:
+    def of(scene: Path, cameras: Path | None, options: ViewOptions) -> "SceneRequest":
         """Return a request for these files with the view options of `options`, whose other fields are ignored."""
         seen = options.model_dump(include=set(ViewOptions.model_fields))
         return SceneRequest(scene=scene, cameras=cameras, **seen)
@@ -293,7 +291,7 @@ class Outputs:
             object.__setattr__(self, name, self.ply.with_name(self.ply.stem + suffix))
 
     @staticmethod
-    def of(out: Path) -> Outputs:
+    def of(out: Path) -> "Outputs":
         """Return the output files of a job, given the name of its PLY or of the compressed file beside it.
 
         Raises:

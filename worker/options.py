@@ -3,8 +3,6 @@
 In addition, the viewpoints of the page that shows its result. PyTorch is not imported.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 import re
@@ -333,7 +331,7 @@ class PaintedFile:
     options: PaintedOptions = field(default_factory=PaintedOptions)
 
     @staticmethod
-    def parse(text: str) -> PaintedFile:
+    def parse(text: str) -> "PaintedFile":
         """Parse FILE or NAME=FILE. If a file named like the whole text exists, the text is its path."""
         name, equals, path = text.partition("=")
         if not equals or Path(text).exists():

@@ -3,8 +3,6 @@
 Run as a script with a folder, this module is the sweeper of that folder (`start_sweeper`); it therefore imports little.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os
@@ -45,7 +43,7 @@ class ProcessId:
     started: float
 
     @staticmethod
-    def of_this() -> ProcessId:
+    def of_this() -> "ProcessId":
         """Return the identifier of the current process."""
         return ProcessId(home(), os.getpid(), psutil.Process().create_time())
 

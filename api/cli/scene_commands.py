@@ -3,8 +3,6 @@
 Results are compared by benchmarks on one's own scene and machine (`bench`), and blindly by eye (`study`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -437,7 +435,7 @@ def quality(
     _print_skipped_variants(quality.curves, out)
 
 
-def _print_skipped_variants(curves: Sequence[Curve], out: Path) -> None:
+def _print_skipped_variants(curves: "Sequence[Curve]", out: Path) -> None:
     """Print which variants were skipped, and where the results are."""
     for curve in curves:
         if curve.left_out:

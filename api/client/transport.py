@@ -1,7 +1,5 @@
 """Requests of the clients: retries after temporary failures, errors, streams of events, and downloads."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -164,7 +162,7 @@ class Transport:
         """Return whether a read error means that there is no service, rather than that it is restarting."""
         return isinstance(error, httpx2.ConnectError) and not self.reached
 
-    def unreachable(self, error: Exception) -> ApiError:
+    def unreachable(self, error: Exception) -> "ApiError":
         """Return the error for a service that did not respond."""
         proxy = _proxy_for(self.url)
         named = proxy and httpx2.URL(proxy).copy_with(userinfo=b"")
@@ -320,7 +318,7 @@ class Job:
         return self.status in ENDED
 
     @staticmethod
-    def of(data: Mapping[str, Any]) -> Job:
+    def of(data: Mapping[str, Any]) -> "Job":
         """Return the job from the service's JSON."""
         return Job(data["id"], data["status"], data.get("progress"), data.get("error"), data)
 

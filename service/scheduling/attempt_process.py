@@ -6,8 +6,6 @@ checkpoint; on SIGUSR1 it finishes the current step and ends the job with its pr
 the dispatcher that started it, and so do the processes that it has started.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
@@ -49,7 +47,7 @@ def run(task: Task) -> None:
         send(Report(ending=Ending(AttemptOutcome.SUCCEEDED, result=result)))
 
 
-def _stylize(task: Task, stopping: threading.Event, finishing: threading.Event) -> Result | None:
+def _stylize(task: Task, stopping: threading.Event, finishing: threading.Event) -> "Result | None":
     from worker.run import Listener, WorkerOptions, stylize
 
     listener = Listener(
@@ -85,7 +83,7 @@ def report_failure(error: Exception) -> None:
         traceback.print_exception(error)
 
 
-def report_prepared(prepared: Prepared) -> None:
+def report_prepared(prepared: "Prepared") -> None:
     """Log the decisions of the plan, and report that the first step starts."""
     for heading, line in prepared.lines:
         log(f"{heading}: {line}")

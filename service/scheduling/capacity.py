@@ -13,8 +13,6 @@ slots.
 Names of dispatchers reveal whether one of this machine still runs. Neither PyTorch nor Ray is imported.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os
@@ -50,7 +48,7 @@ class Machine:
     cluster: bool = False
 
     @staticmethod
-    def find(settings: ServiceSettings) -> Machine:
+    def find(settings: ServiceSettings) -> "Machine":
         """Return this machine, or the portion of the cluster at RAY_ADDRESS that the settings name."""
         cluster = bool(os.environ.get("RAY_ADDRESS"))
         gpus = tuple(str(number) for number in range(settings.cluster_gpus)) if cluster else _own_gpus()

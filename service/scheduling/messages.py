@@ -1,7 +1,5 @@
 """Messages between a dispatcher and the process of an attempt: task, reports, and how the attempt ended."""
 
-from __future__ import annotations
-
 import errno
 import re
 import signal
@@ -58,7 +56,7 @@ class StoreWorkplace:
         """Size of the scene in bytes, once it is read."""
         return scene_size(self.inputs)
 
-    def open(self, rank: int, stored: Stored) -> RankFolder:
+    def open(self, rank: int, stored: Stored) -> "RankFolder":
         """Stage the job's files for a rank.
 
         Missing files are fetched once into the machine's cache, which all its ranks share.
@@ -73,7 +71,7 @@ class StoreWorkplace:
         except OSError as error:
             raise InfrastructureError(f"The job's files cannot be staged here: {error}.") from error
 
-    def after(self, stored: Sequence[Published]) -> StoreWorkplace:
+    def after(self, stored: Sequence[Published]) -> "StoreWorkplace":
         """Return a copy whose checkpoint is the last one among these files."""
         saved = [file for file in stored if file.name == CHECKPOINT]
         return replace(self, checkpoint=saved[-1]) if saved else self

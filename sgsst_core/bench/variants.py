@@ -9,8 +9,6 @@ and is reported separately. All variants are in memory at the same time. A varia
 time if it reaches some loss sooner than all others, and on that of quality if none is better in both style and content.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -316,7 +314,7 @@ def _measures(point: Point) -> dict[str, float | None]:
     return {_MEAN: point.relative, **scales, **judged}
 
 
-def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str) -> Floats:
+def _draw_curves(axes: "Axes", curves: Sequence[Curve], title: str) -> Floats:
     """Draw a measure of points against seconds with one line per curve; return the drawn values."""
     seconds = [column([point.seconds for point in curve.points]) for curve in curves]
     values = [column([_measures(point).get(title) for point in curve.points]) for curve in curves]

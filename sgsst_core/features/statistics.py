@@ -8,8 +8,6 @@ block), and everything is merged in float64 by the pairwise update of Chan, Golu
 Pairwise Algorithm for Computing Sample Variances" (1979).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -63,7 +61,7 @@ class LayerStatistics:
     centered: Tensor  # [c, c]
 
     @staticmethod
-    def zero(channels: int, device: torch.device | str = "cpu") -> LayerStatistics:
+    def zero(channels: int, device: torch.device | str = "cpu") -> "LayerStatistics":
         """Return the statistics of no positions, the neutral element of `merge`."""
         return LayerStatistics(
             torch.zeros((), dtype=torch.float64, device=device),

@@ -4,8 +4,6 @@ Colors are converted to sRGB by ICC profiles, or by those that the chunks gAMA a
 masks are found by name, checked by their headers, and read as their pinhole cameras see them.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 import math
@@ -273,7 +271,7 @@ def _heif_format(path: Path, head: bytes) -> tuple[str, ...]:
     return ("HEIF",)
 
 
-def _profile_of(path: Path, image: Image.Image, warn: Callable[[str], None]) -> ColorProfile | None:
+def _profile_of(path: Path, image: Image.Image, warn: Callable[[str], None]) -> "ColorProfile | None":
     """Return the color profile of an image; None if it has none that changes colors."""
     data = image.info.get("icc_profile")
     if not data and image.format == "PNG":
@@ -293,7 +291,7 @@ def _profile_of(path: Path, image: Image.Image, warn: Callable[[str], None]) -> 
     return profile if profile.changes else None
 
 
-def _to_rgb(path: Path, image: Image.Image, profile: ColorProfile | None, background: Color) -> NDArray[np.float32]:
+def _to_rgb(path: Path, image: Image.Image, profile: "ColorProfile | None", background: Color) -> NDArray[np.float32]:
     """Convert a decoded image of any mode to RGB, [H, W, 3]."""
     if image.mode.startswith(("I", "F")):  # gray with more than 8 bits; Pillow would clip it at 255
         values: NDArray[np.float32] = np.asarray(image, dtype=np.float32)

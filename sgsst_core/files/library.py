@@ -5,8 +5,6 @@ pickle in a ZIP archive. PyTorch loads only tensors and plain values from it. Be
 must be uncompressed, so that they cannot take more memory than the file is long.
 """
 
-from __future__ import annotations
-
 import pickle
 import warnings
 import zipfile
@@ -180,7 +178,7 @@ class TrainerCheckpoint:
         """Return the scene as that of a file of another format than PLY, which states no render mode."""
         return SceneFile(self.path, self.scene, None, None, self.stamp, "checkpoint")
 
-    def stylized(self, scene: Scene, refinement: Refinement | None, sh_attenuation: float) -> TrainerCheckpoint:
+    def stylized(self, scene: Scene, refinement: Refinement | None, sh_attenuation: float) -> "TrainerCheckpoint":
         """Return the checkpoint of a stylized scene; see `stylized_splats`."""
         return replace(self, scene=scene, splats=stylized_splats(self.splats, scene, refinement, sh_attenuation))
 

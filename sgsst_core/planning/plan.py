@@ -4,8 +4,6 @@
 read to find the facts. Thresholds were measured once; what they rest on stands beside them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -141,7 +139,7 @@ class NetworkPixels:
     held: float = 0.0
 
     @staticmethod
-    def of(facts: Facts, settings: Settings, *, weighted: bool) -> NetworkPixels:
+    def of(facts: Facts, settings: Settings, *, weighted: bool) -> "NetworkPixels":
         """Count the pixels of the views that see anything."""
         total, sampled, coarse, again, held, tiles = 0.0, 0.0, 0.0, 0.0, 0.0, 0
         tiling, views = facts.tiling, facts.survey.covered

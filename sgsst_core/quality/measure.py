@@ -4,8 +4,6 @@ Approximations are measured against the exact loss and gradient. Features are fl
 instead of cached. The result is within 1e-6 of the float64 reference (tests/sgsst_core/loss/test_sos.py).
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -49,7 +47,7 @@ class Measurements:
         self.approximated = approximations(stylizer)
 
     @cached_property
-    def exact(self) -> Float32Reference:
+    def exact(self) -> "Float32Reference":
         """Exact loss and gradient of the job."""
         return Float32Reference(self._stylizer, memory_for("measuring", self._stylizer.job.memory))
 

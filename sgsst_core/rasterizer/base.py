@@ -4,8 +4,6 @@ Geometry is frozen, so the image of a view is linear in the colors c: image = W 
 the blend weights and T_final is the final transmittance. The gradient with respect to the colors is W^T dL/dimage.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
@@ -147,11 +145,11 @@ class Rasterizer(ABC):
     # --- cached blend weights ---
 
     @property
-    def uncached(self) -> Rasterizer:
+    def uncached(self) -> "Rasterizer":
         """Rasterizer that computes blend weights in every call, so that images do not depend on what is cached."""
         return self
 
-    def count_weights(self, camera: Camera) -> CountedPieces:
+    def count_weights(self, camera: Camera) -> "CountedPieces":
         """Count a view's weights without storing them; takes about as long as one render.
 
         Raises:

@@ -26,8 +26,6 @@ frozen. Blend weights are recomputed in every call: storing them would save 0.6 
 # Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -81,7 +79,7 @@ class Shapes:
     log2_opacities: NDArray[np.float64]
 
     @classmethod
-    def of(cls, scene: Scene) -> Shapes:
+    def of(cls, scene: Scene) -> "Shapes":
         """Compute the shapes of a scene; they take 32 bytes per Gaussian."""
         shapes = cls(np.empty((len(scene), 3)), np.empty(len(scene)))
         scales, logits = (np.ascontiguousarray(t.numpy()) for t in (scene.scales, scene.opacities))

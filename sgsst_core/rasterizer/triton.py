@@ -17,8 +17,6 @@ of a view never change: an image is W c + T_final background, the color gradient
 reduced to reading W from memory. Weights are stored on the device that applies them, in a layout for this device.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -120,7 +118,7 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
             )
         return chosen
 
-    def count_weights(self, camera: Camera) -> CountedPieces:
+    def count_weights(self, camera: Camera) -> "CountedPieces":
         """Count a view's weights without storing them; takes about as long as one render."""
         return CountedPieces(self, camera)
 

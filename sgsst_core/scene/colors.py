@@ -12,8 +12,6 @@ clamping each channel is the exact projection.
 The levels of a pyramid are exact 2^s x 2^s box averages.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -104,7 +102,7 @@ class ColorSubspace:
     deviation: float
 
     @staticmethod
-    def of(style: Style) -> ColorSubspace | None:
+    def of(style: Style) -> "ColorSubspace | None":
         """Return the color subspace of a style; None if its colors vary in all directions, or in none."""
         mean, covariance = color_moments(some_pixels(style))
         variances, axes = torch.linalg.eigh(covariance.cpu())
@@ -117,7 +115,7 @@ class ColorSubspace:
         offset = center - center @ matrix
         return ColorSubspace(matrix.float(), offset.float(), int(varies.sum()), float(deviations[~varies].max()))
 
-    def to(self, device: torch.device) -> ColorSubspace:
+    def to(self, device: torch.device) -> "ColorSubspace":
         """Return the subspace with its tensors on a device."""
         return replace(self, matrix=self.matrix.to(device), offset=self.offset.to(device))
 

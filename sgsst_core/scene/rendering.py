@@ -3,8 +3,6 @@
 PyTorch is not imported, because the API process and the command line's help read this module.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -43,7 +41,7 @@ class Rendering:
         """Return a description such as "antialiased, eps2d 0.1"."""
         return f"{self.mode}, eps2d {self.eps2d:g}"
 
-    def requested(self, mode: RenderMode, eps2d: float | None) -> Rendering:
+    def requested(self, mode: RenderMode, eps2d: float | None) -> "Rendering":
         """Return the rendering for a requested mode and blur, where None and "auto" stand for this rendering's own.
 
         If the mode changes, the blur is that mode's default. Flat Gaussians stay flat in classic mode.

@@ -5,8 +5,6 @@ the feature network on this machine, in pixels per second, which earlier jobs le
 precision, a network and a style loss, and to a size of steps, because a GPU is slower at small ones.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time
@@ -109,7 +107,7 @@ class JobInputs:
         if not self.cameras:
             raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
 
-    def refined(self, refinement: Refinement | None, scene: Scene | None = None) -> JobInputs:
+    def refined(self, refinement: Refinement | None, scene: Scene | None = None) -> "JobInputs":
         """Return the inputs with their scene refined, unless `scene` is the refined scene."""
         if refinement is None:
             return self

@@ -12,8 +12,6 @@ moved there by this map, are clipped. For a dark object and a bright style of tw
 left, which is why `warm_start` does not use it.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
@@ -284,7 +282,7 @@ class JobStyles:
     @staticmethod
     def prepared(
         style: Style, regions: Regions | None, settings: Settings, sh_dc: Tensor, weights: Tensor
-    ) -> JobStyles:
+    ) -> "JobStyles":
         """Prepare styles as the settings require; see `prepared_style`.
 
         Args:

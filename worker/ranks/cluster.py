@@ -6,8 +6,6 @@ it is closed, and also when the process that started it is killed.
 Estimates of the memory of ranks, from the size of their scene. Neither Ray nor PyTorch is imported.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os
@@ -60,7 +58,7 @@ class Cluster:
         self._sweeper: subprocess.Popen[bytes] | None = None
         self._daemons: list[psutil.Process] = []
 
-    def __enter__(self) -> Cluster:
+    def __enter__(self) -> "Cluster":
         self.open()
         return self
 

@@ -19,8 +19,6 @@ Opacities have 8 bits. Rotations have three components of 10 bits each. SH coeff
 -4 to 4. The layout is that of `splat-transform` (https://github.com/playcanvas/splat-transform).
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Collection
@@ -78,7 +76,7 @@ class PlySceneHeader(SceneHeader):
         sources: Properties of a variant by the name of the usual property that they replace; empty if there are none.
     """
 
-    ply: PlyHeader
+    ply: "PlyHeader"
     stored_coefficients: int
     sources: dict[str, str]
 
@@ -106,7 +104,7 @@ def _sources(kinds: dict[str, str]) -> dict[str, str]:
     return sources
 
 
-def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str]]:
+def _check_properties(path: Path, header: "PlyHeader") -> tuple[int, dict[str, str]]:
     """Check that a PLY is a 3DGS scene before any data is read.
 
     Returns:

@@ -11,8 +11,6 @@ computations use float64, so that the format's own rounding is the only loss.
 A PLY has the axes of its cameras: x right, y down, z forward. A `Frame` converts others.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -111,7 +109,7 @@ class SceneHeader:
         axes: Axes that the scene has in an SPZ, see `spz`.
     """
 
-    format: SceneFormat
+    format: "SceneFormat"
     count: int
     coefficients: int
     notes: tuple[str, ...] = field(default=(), kw_only=True)
@@ -445,7 +443,7 @@ class Frame:
     translation: NDArray[np.float64]
 
     @staticmethod
-    def of(matrix: NDArray[np.float64]) -> Frame:
+    def of(matrix: NDArray[np.float64]) -> "Frame":
         """Split an affine transformation [4, 4].
 
         Raises:

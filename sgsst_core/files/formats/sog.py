@@ -17,8 +17,6 @@ is that of https://developer.playcanvas.com/user-manual/gaussian-splatting/forma
 version. The environment, which is drawn beside any level, is part of the scene. All files may be in a ZIP archive.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -321,7 +319,7 @@ class SogFiles:
     def __init__(self, path: Path, archive: zipfile.ZipFile | None = None, folder: str = "") -> None:
         self.path, self.archive, self.folder = path, archive, folder
 
-    def part(self, folder: str) -> SogFiles:
+    def part(self, folder: str) -> "SogFiles":
         """Return the files with a further prefix."""
         return SogFiles(self.path, self.archive, self.folder + folder)
 
