@@ -768,8 +768,8 @@ def find_upright_subject(
     if requested is not None:
         axis = torch.tensor(requested, dtype=torch.float64)
         axis = axis / axis.norm().clamp_min(1e-300)
-        found = _ground(subject, [axis])
-        return subject, Up(axis, "requested", ground=found is not None and float(found.direction @ axis) > 0)
+        ground = _ground(subject, [axis])
+        return subject, Up(axis, "requested", ground=ground is not None and float(ground.direction @ axis) > 0)
     up = find_up(subject)
     return subject, up if up.sure or subject is whole else find_up(whole)
 
