@@ -322,7 +322,7 @@ class Work:
     Attributes:
         sos: Pixels in a step of phase 2.
         coarse: Pixels in a step of phase 1.
-        measuring: Pixels outside of the steps, in passes for the initial loss and for novel views.
+        measuring: Pixels whose passes take as long as measuring the initial loss and novel views.
     """
 
     sos: float
@@ -450,6 +450,8 @@ _WORTH = {1: 1.0, 2: 1.9, 4: 2.6, 8: 3.4}
 LOSS_VIEWS, NOVEL_VIEWS = 4, 4
 #: Forward passes of a novel view: for the Gram distance before and after the steps, each beside its renders.
 _NOVEL_PASSES = 2
+#: Forward passes that take as long as a novel view with its renders and judgments: 9 to 14 on three scenes.
+_NOVEL_COST = 10
 #: Bytes per optimized Gaussian: color, gradient and two moments, float32.
 OPTIMIZER_BYTES = 4 * 3 * 4
 #: Bytes of a process before it reads a scene: libraries, compiled kernels and the network.
@@ -516,7 +518,7 @@ def make_plan(
     plan = replace(plan, graphs=_has_graphs(plan, facts, settings), novel_views=_novel_views(plan, settings))
     plan = _with_memory(plan, facts, pixels)
     per_rank = settings.views_per_step / plan.ranks
-    passes = (plan.loss_views + _NOVEL_PASSES * plan.novel_views) / 3 if measured else 0.0
+    passes = (plan.loss_views + _NOVEL_COST * plan.novel_views) / 3 if measured else 0.0
     work = Work(per_rank * pixels.sampled, per_rank * pixels.coarse, passes * pixels.all / plan.ranks)
     lines = (
         *about,
