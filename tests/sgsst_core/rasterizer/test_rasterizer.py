@@ -297,7 +297,8 @@ def test_rasterizers_agree_with_an_independent_renderer(rendering: Rendering, lo
         scene, view, colors.double().numpy(), antialiased=rendering.antialiased, eps2d=rendering.eps2d
     )
     assert expected.max() > 0.05
-    for kind in (*ALL, CachedRasterizer):
+    compared: list[type[Rasterizer]] = [*ALL, CachedRasterizer]
+    for kind in compared:
         image = kind(replace(scene, rendering=rendering)).render(colors, view)
         assert independent.psnr(image.double().numpy(), expected) > 60, kind.name
 
