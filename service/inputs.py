@@ -19,35 +19,21 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.files.advice import advice_for_name
 from sgsst_core.files.formats import format_of_name
 from sgsst_core.settings import Option, checked
+from worker import options
 from worker.job import JobSpec, SceneRequest, scene_bytes
-from worker.options import (
-    GROUPS,
-    MOST_PAINTED,
-    MOST_REGIONS,
-    MOST_STYLE_IMAGES,
-    NO_CONTROLS,
-    PaintedFile,
-    PaintedOptions,
-    RegionOptions,
-    RegionRequest,
-    StyleFile,
-    StylizeOptions,
-    ViewOptions,
-    region_requests,
-)
 
 #: Maximum number of characters of a job's name.
 MAX_JOB_NAME = 200
-JobName = Annotated[str, Field(max_length=MAX_JOB_NAME, pattern=NO_CONTROLS)]
+JobName = Annotated[str, Field(max_length=MAX_JOB_NAME, pattern=options.NO_CONTROLS)]
 
 
-class JobParameters(StylizeOptions):
+class JobParameters(options.StylizeOptions):
     """Parameters of a job; omitted ones take the preset's values, as for `sgsst stylize`."""
 
     model_config = ConfigDict(
         json_schema_extra={
             "examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}],
-            "x-groups": {title: [*names] for title, names in GROUPS.items()},
+            "x-groups": {title: [*names] for title, names in options.GROUPS.items()},
         }
     )
 
@@ -66,30 +52,30 @@ class JobParameters(StylizeOptions):
     ] = Field(
         None,
         min_length=1,
-        max_length=MOST_STYLE_IMAGES,
+        max_length=options.MOST_STYLE_IMAGES,
         description="Weight of each style image that belongs to no region, in upload order: images are mixed in "
         "proportion. Default: equal weights.",
     )
-    regions: Annotated[list[RegionOptions] | None, Option(instead="--region NAME:SPEC")] = Field(
+    regions: Annotated[list[options.RegionOptions] | None, Option(instead="--region NAME:SPEC")] = Field(
         None,
-        max_length=MOST_REGIONS + 1,
+        max_length=options.MOST_REGIONS + 1,
         description="Regions of the scene, each with its own style or frozen. Where regions overlap, the later one "
         "wins.",
     )
-    painted: Annotated[list[PaintedOptions] | None, Option(instead="--view NAME=FILE")] = Field(
+    painted: Annotated[list[options.PaintedOptions] | None, Option(instead="--view NAME=FILE")] = Field(
         None,
-        max_length=MOST_PAINTED,
+        max_length=options.MOST_PAINTED,
         description="Views of the painted files, in upload order. Without views, the files state them.",
     )
 
     @property
-    def region_requests(self) -> tuple[RegionRequest, ...]:
+    def region_requests(self) -> tuple[options.RegionRequest, ...]:
         """Return the requested regions.
 
         Raises:
             SettingsError: If the regions are inconsistent.
         """
-        return region_requests(self.regions or (), exists=lambda path: False)
+        return options.region_requests(self.regions or (), exists=lambda path: False)
 
     @property
     def renders_views(self) -> bool:
@@ -113,7 +99,7 @@ class JobParameters(StylizeOptions):
 
 
 #: Parameters that apply to jobs with painted files.
-_WITH_PAINTED = {"name", "painted", "background", "pad_sh", *ViewOptions.model_fields}
+_WITH_PAINTED = {"name", "painted", "background", "pad_sh", *options.ViewOptions.model_fields}
 
 
 def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
@@ -140,7 +126,7 @@ ROLES = ("scene", "style", "cameras", "photos", "mask", "painted")
 #: Roles whose files keep their folders: cameras and regions refer to them by relative paths.
 _FOLDER_ROLES = ("photos", "mask")
 #: Maximum number of style images: those that belong to no region, plus one for each region.
-MOST_STYLES = MOST_STYLE_IMAGES + MOST_REGIONS
+MOST_STYLES = options.MOST_STYLE_IMAGES + options.MOST_REGIONS
 #: Maximum number of camera files: a COLMAP model has up to five (cameras, images, points3D, rigs, frames), and a
 #: transforms.json may come with a dataparser_transforms.json.
 MAX_CAMERA_FILES = 8
@@ -200,7 +186,7 @@ def _safe(part: str) -> str:
     return f"_{plain[1:]}" if plain.startswith(".") else plain
 
 
-def default_job_name(inputs: Sequence[Mapping[str, Any]], regions: Sequence[RegionRequest] = ()) -> str:
+def default_job_name(inputs: Sequence[Mapping[str, Any]], regions: Sequence[options.RegionRequest] = ()) -> str:
     """Return the name of a job whose request has none: "scene · painting", without the paintings of regions."""
     scene = next(entry["name"] for entry in inputs if entry["role"] == "scene")
     taken = region_styles(regions)
@@ -217,12 +203,12 @@ def scene_size(inputs: Sequence[Mapping[str, Any]]) -> int:
     return sum(scene_bytes(entry["name"], entry["size"]) for entry in inputs if entry["role"] == "scene")
 
 
-def region_styles(regions: Sequence[RegionRequest]) -> list[str]:
+def region_styles(regions: Sequence[options.RegionRequest]) -> list[str]:
     """Return the staged names of the style files of regions."""
     return [staged_name("style", str(file.path)) for region in regions for file in region.styles]
 
 
-def region_mask(region: RegionRequest) -> Path | None:
+def region_mask(region: options.RegionRequest) -> Path | None:
     """Return the staged path of a region's mask or folder of masks; None if it is selected in another way."""
     path = region.selection and region.selection.path
     return Path("mask", staged_name("mask", str(path))) if path else None
@@ -233,7 +219,7 @@ def check_roles(
     *,
     orbit: bool,
     weights: Sequence[float] | None = None,
-    regions: Sequence[RegionRequest] = (),
+    regions: Sequence[options.RegionRequest] = (),
 ) -> None:
     """Raise an error unless a job has exactly the files that it needs.
 
@@ -247,7 +233,7 @@ def check_roles(
     """
     by_role = {role: [entry for entry in inputs if entry["role"] == role] for role in ROLES}
     painted = bool(by_role["painted"])
-    for role, most in (("scene", 1), ("painted", MOST_PAINTED) if painted else ("style", MOST_STYLES)):
+    for role, most in (("scene", 1), ("painted", options.MOST_PAINTED) if painted else ("style", MOST_STYLES)):
         if not 1 <= len(by_role[role]) <= most:
             what = "is missing" if not by_role[role] else f"was sent {len(by_role[role])} times"
             times = "once" if most == 1 else f"once, or up to {most} of them"
@@ -291,7 +277,7 @@ def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int
     return own
 
 
-def _check_region_masks(names: Sequence[str], regions: Sequence[RegionRequest]) -> None:
+def _check_region_masks(names: Sequence[str], regions: Sequence[options.RegionRequest]) -> None:
     """Verify that the masks of regions have been sent, and that every mask belongs to a region."""
     unused = set(names)
     for region in regions:
@@ -379,7 +365,7 @@ def _camera_path(files: Sequence[Path]) -> Path | None:
     return Path("cameras") if files else None
 
 
-def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, ...]:
+def _regions(staged: Staged, parameters: JobParameters) -> tuple[options.RegionRequest, ...]:
     """Return the regions with the paths of their staged styles and masks."""
     paths = {path.name: path for path in staged.styles}
     return tuple(
@@ -397,10 +383,10 @@ def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:
     taken = region_styles(parameters.region_requests)
     own = [path for path in staged.styles if path.name not in taken]
     weights = parameters.style_weights or [1.0] * len(own)
-    views = [*(parameters.painted or ()), *[PaintedOptions()] * len(staged.painted)]
+    views = [*(parameters.painted or ()), *[options.PaintedOptions()] * len(staged.painted)]
     return JobSpec(
         source=SceneRequest.of(staged.scene, staged.cameras, parameters),
-        styles=tuple(StyleFile(path, weight) for path, weight in zip(own, weights, strict=True)),
+        styles=tuple(options.StyleFile(path, weight) for path, weight in zip(own, weights, strict=True)),
         images=staged.photos,
         out=Path("out", RESULT),
         settings=parameters.settings(),
@@ -409,7 +395,7 @@ def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:
         colors=True,
         style_background=parameters.style_background,
         pad_sh=parameters.pad_sh,
-        paintings=tuple(map(PaintedFile, staged.painted, views)),
+        paintings=tuple(map(options.PaintedFile, staged.painted, views)),
     )
 
 

@@ -19,6 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from sgsst_core.errors import OutputError, SceneError, SettingsError
+from sgsst_core.files import scene_file
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import format_of_name, read_scene_header, scene_path
 from sgsst_core.files.formats.ply import PLY
@@ -26,21 +27,6 @@ from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.formats.sog import INDEX_NAME, META_NAME, SOG, STREAMED_SOG
 from sgsst_core.files.images import Color, to_image
 from sgsst_core.files.library import TrainerCheckpoint, load_scene
-from sgsst_core.files.scene_file import (
-    USD_SUFFIXES,
-    SceneFile,
-    blend_scenes,
-    check_same_shape,
-    check_usd,
-    common_rests,
-    encode_blend,
-    encode_scene,
-    losses,
-    read_scene,
-    write_levels,
-    write_sog_folder,
-    write_usd,
-)
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit import ELEVATION, find_upright_subject, turntable
 from sgsst_core.progress import Decision, warnings_of
@@ -52,19 +38,8 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
+from worker import inputs
 from worker.execute import describe_scene
-from worker.inputs import (
-    Capture,
-    about_notes,
-    about_rendering,
-    check_something_in_view,
-    choose_axes,
-    cropped,
-    orbit_request,
-    read_capture,
-    read_job_capture,
-    read_requested,
-)
 from worker.job import JobSpec, SceneRequest, check_choice, check_folder, check_is_not_input, result_format
 from worker.options import DEFAULT_SIDE, MOST_VIEWPOINT_NAME, VideoOptions, Viewpoint, Viewpoints
 
@@ -116,10 +91,10 @@ def convert(
     Raises:
         InvalidInputError: If scene, cameras or output cannot be used.
     """
-    is_usd = out.suffix.lower() in USD_SUFFIXES
+    is_usd = out.suffix.lower() in scene_file.USD_SUFFIXES
     streamed = out.name == INDEX_NAME or format_of_name(out.name) is STREAMED_SOG
     if is_usd:
-        check_usd(out)
+        scene_file.check_usd(out)
         if compare:
             raise OutputError(f"{out}: USD can only be written, so it cannot be compared. Omit --compare.")
     elif streamed and not levels_of and read_scene_header(source.scene).format is not STREAMED_SOG:
@@ -136,27 +111,27 @@ def convert(
         check_is_not_input(out, scene_path(path))
     if compare and source.cameras is None and source.orbit is None:
         source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
-    axes, decisions = choose_axes(source, images)
+    axes, decisions = inputs.choose_axes(source, images)
     loaded = load_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     file = loaded.scene_file() if isinstance(loaded, TrainerCheckpoint) else loaded
     file = file.rendered(source.render_mode, source.eps2d)
-    scene, decisions = file.scene, [*about_notes(file), *decisions, *about_rendering(file)]
+    scene, decisions = file.scene, [*inputs.about_notes(file), *decisions, *inputs.about_rendering(file)]
     cameras: list[Camera] = []
     if source.cameras or source.orbit:
-        capture = read_capture(source, scene, images)
+        capture = inputs.read_capture(source, scene, images)
         capture = (capture.fitted(settings) if settings else capture).checked(scene, source.near)
         cameras, decisions = capture.cameras, [*decisions, *capture.decisions]
     out.parent.mkdir(parents=True, exist_ok=True)
     size = None
     if streamed:
-        size = write_levels(out, scene, levels_of or source.scene)
+        size = scene_file.write_levels(out, scene, levels_of or source.scene)
     elif out.name == META_NAME:
-        size = write_sog_folder(out.parent, scene)
+        size = scene_file.write_sog_folder(out.parent, scene)
     elif is_usd:
-        write_usd(out, scene)
+        scene_file.write_usd(out, scene)
     else:
         with _written(out, in_place=in_place) as path, path.open("wb") as stream:
-            encode_scene(stream, scene, result_format(out), out, pad_sh=pad_sh, axes=file.axes)
+            scene_file.encode_scene(stream, scene, result_format(out), out, pad_sh=pad_sh, axes=file.axes)
     stated = CLASSIC if is_usd else read_scene_header(out).tag.rendering
     if stated != scene.rendering:
         reason = f"its format cannot state {scene.rendering.text}"
@@ -172,7 +147,7 @@ def convert(
 
 def about_losses(scene: Scene, format: SceneFormat, out: Path) -> list[Decision]:
     """Return warnings about what a format cannot hold of a scene."""
-    return [Decision("scene", f"warning: {out.name} loses detail", note) for note in losses(scene, format)]
+    return [Decision("scene", f"warning: {out.name} loses detail", note) for note in scene_file.losses(scene, format)]
 
 
 def blend(parts: Sequence[tuple[SceneRequest, float]], out: Path, *, in_place: bool = False) -> list[Decision]:
@@ -190,12 +165,13 @@ def blend(parts: Sequence[tuple[SceneRequest, float]], out: Path, *, in_place: b
     for source, _ in parts:
         check_is_not_input(out, source.scene)
     files = [
-        read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes) for source, _ in parts
+        scene_file.read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes)
+        for source, _ in parts
     ]
-    blended = blend_scenes(files, [weight for _, weight in parts])
+    blended = scene_file.blend_scenes(files, [weight for _, weight in parts])
     out.parent.mkdir(parents=True, exist_ok=True)
     with _written(out, in_place=in_place) as path, path.open("wb") as stream:
-        encode_blend(stream, blended, format, out)
+        scene_file.encode_blend(stream, blended, format, out)
     return about_losses(blended.scene, format, out)
 
 
@@ -215,8 +191,8 @@ _POSTER_SIDE, _POSTER_QUALITY = 960, 90
 def write_page(
     out: Path,
     viewer: Mapping[str, str],
-    stylized: SceneFile,
-    original: SceneFile | None,
+    stylized: scene_file.SceneFile,
+    original: scene_file.SceneFile | None,
     title: str,
     *,
     background: Color = (0.0, 0.0, 0.0),
@@ -307,10 +283,10 @@ def write_poster(
     to_image(image).save(out, format="JPEG", quality=_POSTER_QUALITY)
 
 
-def _fade(stylized: SceneFile, original: SceneFile) -> float:
+def _fade(stylized: scene_file.SceneFile, original: scene_file.SceneFile) -> float:
     """Return the fraction by which the harmonics of the stylized scene are smaller than those of the original."""
-    check_same_shape(original, stylized)
-    before, after = common_rests([original.scene, stylized.scene])
+    scene_file.check_same_shape(original, stylized)
+    before, after = scene_file.common_rests([original.scene, stylized.scene])
     if torch.equal(before, after):
         return 0.0
     factor = float((before.double() * after.double()).sum() / before.double().square().sum())
@@ -324,7 +300,7 @@ def _fade(stylized: SceneFile, original: SceneFile) -> float:
 
 def _sog(scene: Scene, out: Path) -> bytes:
     stream = io.BytesIO()
-    encode_scene(stream, scene, SOG, out)
+    scene_file.encode_scene(stream, scene, SOG, out)
     return stream.getvalue()
 
 
@@ -407,20 +383,22 @@ def render_video(
         InvalidInputError: If an input cannot be used, or the video cannot be written.
     """
     source = request.source
-    file, decisions = read_requested(source)
+    file, decisions = inputs.read_requested(source)
     scene, before = file.scene, None
     if request.unstylized is not None:
-        before = read_requested(source.model_copy(update={"scene": request.unstylized}))[0].scene
+        before = inputs.read_requested(source.model_copy(update={"scene": request.unstylized}))[0].scene
     through = remaining = None
     if request.along_cameras:
         capture = _read_views(request, file).checked(scene, source.near)
         through, decisions = capture.cameras, [*decisions, *capture.decisions]
     elif request.job is not None and request.job.regions:
-        file, _ = read_requested(request.job.source)  # regions select its Gaussians, which may have been split since
-        remaining = cropped(request.job.regions, file, source.near)
+        file, _ = inputs.read_requested(
+            request.job.source
+        )  # regions select its Gaussians, which may have been split since
+        remaining = inputs.cropped(request.job.regions, file, source.near)
     even, side = is_encoded(request.out), source.resolution
     cameras = video_cameras(file.scene, source, through, request.options, side, remaining, even=even)
-    check_something_in_view(scene, cameras, source.near)
+    inputs.check_something_in_view(scene, cameras, source.near)
     for line in warnings_of(decisions):
         warn(line)
     background = (0.0, 0.0, 0.0) if request.transparent else request.background
@@ -480,7 +458,7 @@ def video_cameras(
         path = CameraPath(in_path_order(ahead or through)).evenly(options.frames)
         side = side or min(DEFAULT_SIDE, max(path[0].width, path[0].height))
         return [framed(camera, side, even=even) for camera in path]
-    request = orbit_request(source)
+    request = inputs.orbit_request(source)
     subject, up = find_upright_subject(scene, request.up, remaining)
     cameras = turntable(
         subject,
@@ -494,11 +472,11 @@ def video_cameras(
     return [framed(camera, None, even=even) for camera in cameras]
 
 
-def _read_views(request: VideoRequest, file: SceneFile) -> Capture:
+def _read_views(request: VideoRequest, file: scene_file.SceneFile) -> inputs.Capture:
     """Read or generate the views that a path leads through, given the scene of the video."""
     job = request.job
     if job is None:
-        return read_capture(request.source, file.scene)
+        return inputs.read_capture(request.source, file.scene)
     if job.source.cameras is None:  # an orbit depends on the job's scene, whose Gaussians may have been split since
-        file, _ = read_requested(job.source)
-    return read_job_capture(job, file)
+        file, _ = inputs.read_requested(job.source)
+    return inputs.read_job_capture(job, file)

@@ -20,16 +20,7 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from sgsst_core import container
-from sgsst_core.errors import (
-    CameraError,
-    ImageError,
-    MaskError,
-    SceneError,
-    SceneTooLargeError,
-    SettingsError,
-    SgsstError,
-)
+from sgsst_core import container, errors
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
@@ -52,15 +43,8 @@ from sgsst_core.files.images import (
 from sgsst_core.files.scene_file import SceneFile, read_property, read_scene
 from sgsst_core.orbit import Orbit, OrbitRequest, find_subject, find_up, make_orbit
 from sgsst_core.parallel import ALONE, Collectives
+from sgsst_core.planning import survey
 from sgsst_core.planning.plan import OPTIMIZER_BYTES, check_scales
-from sgsst_core.planning.survey import (
-    compare_photos,
-    frame_warnings,
-    implausible,
-    nothing_seen,
-    sees_something,
-    shown_by,
-)
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
@@ -222,7 +206,7 @@ def errors_of(role: str) -> Iterator[None]:
         yield
     except BaseException as error:
         if not hasattr(error, "role"):
-            error.role = "mask" if isinstance(error, MaskError) else role  # type: ignore[attr-defined]
+            error.role = "mask" if isinstance(error, errors.MaskError) else role  # type: ignore[attr-defined]
         raise
 
 
@@ -243,7 +227,9 @@ def check_frames_have_sizes(path: Path) -> None:
         frames = content.get("frames") if isinstance(content, dict) else None
         for index, frame in enumerate(frames if isinstance(frames, list) else []):
             if isinstance(frame, dict) and any(frame.get(side) is None and content.get(side) is None for side in "wh"):
-                raise CameraError(f"{file}: camera {index}: gives no size. Add the sizes of the images as 'w' and 'h'.")
+                raise errors.CameraError(
+                    f"{file}: camera {index}: gives no size. Add the sizes of the images as 'w' and 'h'."
+                )
 
 
 def fingerprint_of(inputs: Inputs, settings: Settings, weights: str, collectives: Collectives) -> str:
@@ -261,7 +247,7 @@ def fingerprint_of(inputs: Inputs, settings: Settings, weights: str, collectives
     fingerprints = collectives.all_gather((own, socket.gethostname()))
     for other, host in fingerprints:
         if other != fingerprints[0][0]:
-            raise SettingsError(
+            raise errors.SettingsError(
                 f"The files of this job are not the same on {fingerprints[0][1]} and {host}: scene, cameras, style or "
                 "weights differ. Give paths on a file system that all machines share."
             )
@@ -350,8 +336,8 @@ def check_something_seen(scene: Scene, cameras: Sequence[Camera], rasterizer: Ra
     Raises:
         CameraError: If no camera sees a Gaussian.
     """
-    if not any(sees_something(rasterizer.coverage(camera)) for camera in cameras):
-        raise nothing_seen(scene.means, cameras, rasterizer.near)
+    if not any(survey.sees_something(rasterizer.coverage(camera)) for camera in cameras):
+        raise survey.nothing_seen(scene.means, cameras, rasterizer.near)
 
 
 #: Views that are rendered to find whether cameras see anything, and Gaussians in all of them together.
@@ -367,12 +353,12 @@ def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float
     Raises:
         CameraError: If no camera sees a Gaussian.
     """
-    if shown_by(scene.means, cameras, near).together:
+    if survey.shown_by(scene.means, cameras, near).together:
         return
     views = spread(cameras, _MAX_VIEWS)
     rasterizer = make_rasterizer("cpu", sampled(scene, _MAX_GAUSSIANS // len(views)), near=near, memory=0)
-    if not any(sees_something(rasterizer.coverage(camera)) for camera in views):
-        raise nothing_seen(scene.means, cameras, near)
+    if not any(survey.sees_something(rasterizer.coverage(camera)) for camera in views):
+        raise survey.nothing_seen(scene.means, cameras, near)
 
 
 def together(collectives: Collectives, make: Callable[[], T]) -> T:
@@ -384,7 +370,7 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
     value, error = None, None
     try:
         value = make()
-    except SgsstError as own:
+    except errors.SgsstError as own:
         error = own
     for raised in collectives.all_gather(error):
         if raised is not None:
@@ -511,7 +497,7 @@ def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], nea
     rasterizer = make_rasterizer("cpu", file.scene, near=near)
     inside, total = count_votes(rasterizer, [camera for camera, _ in masked], masks, len(file.scene))
     if not bool((total > 0).any()):
-        raise ImageError(f"{folder}: no view that has a mask sees a Gaussian. Give masks of other views.")
+        raise errors.ImageError(f"{folder}: no view that has a mask sees a Gaussian. Give masks of other views.")
     return decide_by_votes(file.scene.means, inside, total)
 
 
@@ -548,7 +534,7 @@ def check_memory(path: Path, collectives: Collectives, growth: float = 1.0) -> N
         needs.append((f"on its GPU ({torch.cuda.get_device_name()})", scene_bytes + own, torch.cuda.mem_get_info()[0]))
     for where, needed, free in needs:
         if needed > free:
-            raise SceneTooLargeError(
+            raise errors.SceneTooLargeError(
                 f"Rank {collectives.rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need "
                 f"{needed / 1e9:.2f} GB {where}, but {free / 1e9:.2f} GB are free. Give a machine with more memory, "
                 "fewer --workers on each, or a smaller scene."
@@ -621,10 +607,10 @@ class Capture:
         """
         if self.orbit is not None:
             return self
-        decisions = [*implausible(scene.means, self.cameras), *frame_warnings(scene, self.cameras, near)]
+        decisions = [*survey.implausible(scene.means, self.cameras), *survey.frame_warnings(scene, self.cameras, near)]
         photos = self.photos
         if photos is not None:
-            photos, about = compare_photos(scene, self.cameras, photos, near)
+            photos, about = survey.compare_photos(scene, self.cameras, photos, near)
             decisions += about
         return replace(self, photos=photos, decisions=(*decisions, *self.decisions))
 
@@ -679,7 +665,7 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
         if source.cameras is not None:
             cameras = read_cameras(source.cameras, images)
         scene = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes="rdf").scene
-    except (SceneError, CameraError):
+    except (errors.SceneError, errors.CameraError):
         return requested, []
     return _seen_axes(scene.means, cameras, source.near) if cameras else _upright_axes(scene, source.up)
 
@@ -697,8 +683,8 @@ def _upright_axes(scene: Scene, requested_up: str) -> tuple[SpzAxes, list[Decisi
 
 def _seen_axes(means: Tensor, cameras: Sequence[Camera], near: float) -> tuple[SpzAxes, list[Decision]]:
     """Return the axes under which cameras see positions [N, 3] that were read as RDF; see `choose_axes`."""
-    rdf = shown_by(means, cameras, near).typical
-    rub = shown_by(means * means.new_tensor([1, -1, -1]), cameras, near).typical
+    rdf = survey.shown_by(means, cameras, near).typical
+    rub = survey.shown_by(means * means.new_tensor([1, -1, -1]), cameras, near).typical
     if rub <= _CLEARLY_MORE * rdf:
         return ("rdf" if rdf > _CLEARLY_MORE * rub else "auto"), []
     reason = f"a typical view has {rub:.1%} of the Gaussians in its frame so, and {rdf:.1%} with rdf; see --spz-axes"

@@ -11,16 +11,7 @@ from rich.progress import BarColumn, TextColumn
 from rich.table import Column, Table
 from stamina.instrumentation import RetryDetails, set_on_retry_hooks
 
-from api.cli import INTERRUPTED
-from api.cli.console import (
-    EARLY_ENDS,
-    JOB_FAILED,
-    PlainConsole,
-    counting_bar,
-    error_console,
-    loss_text,
-    out_console,
-)
+from api.cli import INTERRUPTED, console
 from api.cli.options import (
     JsonOption,
     KeyOption,
@@ -105,20 +96,20 @@ def submit(
     files["painted"] = {file.path: file.options.model_dump(exclude_none=True) for file in inputs.painted}
     with open_client(url, key) as client:
         if dry_run:
-            with counting_bar("checking", in_bytes=False) as planning:
+            with console.counting_bar("checking", in_bytes=False) as planning:
                 plan = client.plan(inputs.scene, styles, **files, planning=planning, **settings)
-            out_console.print(json.dumps(plan) if as_json else _plan_text(plan))
+            console.out_console.print(json.dumps(plan) if as_json else _plan_text(plan))
             return
-        with counting_bar("sending") as progress:
+        with console.counting_bar("sending") as progress:
             settings |= {"webhook": webhook, "webhook_events": webhook_events or ()}
             job = client.submit(inputs.scene, styles, **files, progress=progress, **settings)
         if out is None:
-            out_console.print(json.dumps(job.data) if as_json else job.id)
+            console.out_console.print(json.dumps(job.data) if as_json else job.id)
             if not as_json:
-                error_console.print(f"Progress: sgsst watch {job.id}    Result: sgsst download {job.id}")
+                console.error_console.print(f"Progress: sgsst watch {job.id}    Result: sgsst download {job.id}")
             return
         if not as_json:
-            error_console.print(job.id)
+            console.error_console.print(job.id)
         conclude(client, follow(client, job.id, as_json), out, as_json)
 
 
@@ -174,9 +165,9 @@ def watch(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, 
     with open_client(url, key) as client:
         ended = follow(client, job, as_json)
     if not as_json:
-        out_console.print(_job_text(ended))
+        console.out_console.print(_job_text(ended))
     if ended.status != "succeeded":
-        raise typer.Exit(JOB_FAILED)
+        raise typer.Exit(console.JOB_FAILED)
 
 
 def download(
@@ -220,9 +211,9 @@ def download(
                     f"{target}: exists, and is not this job's file. Write to another file with --out, or pass "
                     "--overwrite."
                 )
-            with counting_bar(each) as progress:
+            with console.counting_bar(each) as progress:
                 written.append(str(client.download(job, target, each, progress)))
-    out_console.print(json.dumps(written) if as_json else "\n".join(written))
+    console.out_console.print(json.dumps(written) if as_json else "\n".join(written))
 
 
 def _check_names(names: Sequence[str]) -> None:
@@ -260,7 +251,7 @@ def share(
     """Create a read-only link to a result, for people without a key."""
     with open_client(url, key) as client:
         link = client.share(job, days, poster=poster)
-    out_console.print(json.dumps(link) if as_json else link["url"])
+    console.out_console.print(json.dumps(link) if as_json else link["url"])
 
 
 def delete(job: JobArgument, url: UrlOption = None, key: KeyOption = None) -> None:
@@ -280,14 +271,14 @@ def jobs(
     with open_client(url, key) as client:
         page = list(client.jobs(status=status or (), limit=limit))
     if as_json:
-        out_console.print(json.dumps([job.data for job in page]))
+        console.out_console.print(json.dumps([job.data for job in page]))
         return
     fixed = (Column(heading, no_wrap=True) for heading in ("id", "status", "created"))
     table = Table(*fixed, "name", box=None, pad_edge=False)
     for job in page:
         created = datetime.fromisoformat(job.data["created_at"]).astimezone()
         table.add_row(job.id, _short_status(job), f"{created:%m-%d %H:%M}", job.data["name"])
-    PlainConsole().print(table)
+    console.PlainConsole().print(table)
 
 
 def usage(
@@ -314,14 +305,14 @@ def usage(
 
         rows = usage_of_all(data, since, until)
     if as_json:
-        out_console.print(json.dumps(rows))
+        console.out_console.print(json.dumps(rows))
         return
     numeric = (Column(name, justify="right") for name in ("jobs", "GPU s", "CPU s", "MB"))
     table = Table("day", Column("key", min_width=35), "name", *numeric, box=None, pad_edge=False)
     for row in rows:
         numbers = row["jobs"], row["gpu_seconds"], row["cpu_seconds"], row["bytes"] / 1e6
         table.add_row(row["day"], row["key"], row["name"], *(f"{number:,.0f}" for number in numbers))
-    PlainConsole().print(table)
+    console.PlainConsole().print(table)
 
 
 def mcp(
@@ -351,7 +342,7 @@ def open_client(url: str | None, key: str | None) -> Client:
 
 def _print_retry(details: RetryDetails) -> None:
     what = str(details.caused_by) or type(details.caused_by).__name__
-    error_console.print(f"{what}: retrying in {details.wait_for:.0f} s")
+    console.error_console.print(f"{what}: retrying in {details.wait_for:.0f} s")
 
 
 def follow(client: Client, job_id: str, as_json: bool) -> Job:
@@ -359,7 +350,7 @@ def follow(client: Client, job_id: str, as_json: bool) -> Job:
     try:
         return _show_events(client, job_id, as_json)
     except KeyboardInterrupt:
-        error_console.print(
+        console.error_console.print(
             f"The job continues on the service.\nProgress: sgsst watch {job_id}    Cancel: sgsst cancel {job_id}"
         )
         raise typer.Exit(INTERRUPTED) from None
@@ -367,42 +358,42 @@ def follow(client: Client, job_id: str, as_json: bool) -> Job:
 
 def _show_events(client: Client, job_id: str, as_json: bool) -> Job:
     """Show events until the job has ended: as a live bar on a terminal, as lines elsewhere, or as JSON lines."""
-    live = error_console.is_terminal and not as_json
+    live = console.error_console.is_terminal and not as_json
     title, text = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[text]}", markup=False)
-    with live_bar(error_console, title, BarColumn(), text, enabled=not as_json) as bar:
+    with live_bar(console.error_console, title, BarColumn(), text, enabled=not as_json) as bar:
         task = bar.add_task("waiting", total=1.0, text="")
         for event in client.watch(job_id):
             if as_json:
-                out_console.print(json.dumps({"id": event.id, "event": event.kind, **event.data}))
+                console.out_console.print(json.dumps({"id": event.id, "event": event.kind, **event.data}))
             elif event.kind == "status":
                 bar.update(task, description=event.data["status"])
                 if not live:
-                    error_console.print(f"{event.data['status']} (attempt {event.data['attempt']})")
+                    console.error_console.print(f"{event.data['status']} (attempt {event.data['attempt']})")
             elif event.kind == "progress":
                 line = Progress.model_validate(event.data).text()
                 bar.update(task, completed=event.data["fraction"], text=line)
                 if not live:
-                    error_console.print(line)
+                    console.error_console.print(line)
     return client.job(job_id)
 
 
 def conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
     """Download the result of a job that has ended; exit with 5 if it did not succeed."""
     if job.status != "succeeded":
-        error_console.print(_job_text(job))
-        raise typer.Exit(JOB_FAILED)
+        console.error_console.print(_job_text(job))
+        raise typer.Exit(console.JOB_FAILED)
     result = job.data["result"]
     if result["steps"] < result.get("total", 0):
-        error_console.print(
-            f"Steps: {_step_count_text(result)}; loss {loss_text(result['loss_before'], result['loss_after'])}"
+        console.error_console.print(
+            f"Steps: {_step_count_text(result)}; loss {console.loss_text(result['loss_before'], result['loss_after'])}"
         )
-    with counting_bar(out.name) as progress:
+    with console.counting_bar(out.name) as progress:
         client.download(job.id, out, progress=progress)
-    out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
+    console.out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
 
 
 def _print_job(job: Job, as_json: bool) -> None:
-    out_console.print(json.dumps(job.data) if as_json else _job_text(job))
+    console.out_console.print(json.dumps(job.data) if as_json else _job_text(job))
 
 
 def _progress_text(job: Job) -> str:
@@ -431,7 +422,7 @@ def _job_text(job: Job) -> str:
             painted = f"{result['psnr_before']:.1f} dB before, {result['psnr_after']:.1f} dB after"
             lines.append(f"{'painted:':<12}{painted}")
         else:
-            lines.append(f"{'loss:':<12}{loss_text(result['loss_before'], result['loss_after'])}")
+            lines.append(f"{'loss:':<12}{console.loss_text(result['loss_before'], result['loss_after'])}")
     if job.error:
         lines.append(f"{'error:':<12}{job.error['message']}")
     return "\n".join(lines)
@@ -442,7 +433,7 @@ def _step_count_text(result: Any) -> str:
     steps, total = result["steps"], result.get("total")  # results of earlier versions have no total
     if total is None or steps >= total:
         return str(steps)
-    return f"{steps} of {total}: {EARLY_ENDS.get(result['stopped'], result['stopped'])}"
+    return f"{steps} of {total}: {console.EARLY_ENDS.get(result['stopped'], result['stopped'])}"
 
 
 def _plan_text(plan: Any) -> str:

@@ -19,18 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from api.cli.console import (
-    EARLY_ENDS,
-    FAILURE,
-    JOB_FAILED,
-    Invocation,
-    counting_bar,
-    error_console,
-    leave_terminal,
-    loss_text,
-    out_console,
-    print_field,
-)
+from api.cli import console
 from api.cli.machine_commands import fetch
 from api.cli.options import (
     JobArguments,
@@ -87,7 +76,7 @@ def stylize(
 ) -> None:
     """Stylize a scene with one or several style images."""
     request = inputs.request(options, out, resume=run.resume)
-    invocation: Invocation = context.obj
+    invocation: console.Invocation = context.obj
     run_options = WorkerOptions(run.rank_timeout, run.checkpoint_seconds, started=invocation.started)
     run_job(request, _resuming(invocation.arguments), options.workers, run_options)
 
@@ -105,7 +94,7 @@ def demo(
         load_network_weights("auto")
     except WeightsError:
         fetch("vgg16")
-    with error_console.status("Building the scene"):
+    with console.error_console.status("Building the scene"):
         ply, cameras, style = build_demo(out)
     chosen = {"preset": "preview", "resolution": DEMO_RESOLUTION, "steps_sos": DEMO_STEPS, "within": DEMO_SECONDS}
     inputs = JobArguments(str(ply), [str(style)], str(cameras))
@@ -113,7 +102,7 @@ def demo(
     given = {"style": style, "cameras": cameras, "out": request.out, **chosen}
     options = [(f"--{name.replace('_', '-')}", str(value)) for name, value in given.items()]
     arguments = ["stylize", str(ply), *itertools.chain(*options)]
-    print_field("command", shlex.join(["sgsst", *arguments]))
+    console.print_field("command", shlex.join(["sgsst", *arguments]))
     run_job(request, _resuming(arguments))
 
 
@@ -135,11 +124,11 @@ def run_job(
     """
     from worker.run import Listener, stylize
 
-    outputs, stop, notify = check_request(request), StopFlag(), error_console.print
+    outputs, stop, notify = check_request(request), StopFlag(), console.error_console.print
     with ExitStack() as stack:
         if workers is not None:  # the processes of ranks are ended in order even before the first step
             stack.enter_context(stop.on_signal(_announce_stop))
-        bar = stack.enter_context(job_bar(error_console))
+        bar = stack.enter_context(job_bar(console.error_console))
         from sgsst_core.compiled import compilations_reported  # takes seconds to import
 
         stack.enter_context(compilations_reported(bar.show_compiling))
@@ -148,7 +137,7 @@ def run_job(
             if workers is None:
                 stack.enter_context(stop.on_signal(_announce_stop))
             for heading, line in summary.lines:
-                print_field(heading, line)
+                console.print_field(heading, line)
 
         listener = Listener(prepared, bar.show, warn=notify, stop=stop, happened=notify)
         ended = stylize(request, workers, listener, options or WorkerOptions())
@@ -156,7 +145,7 @@ def run_job(
         _print_interruption(outputs, ended, command)
         raise typer.Exit(stop.exit_code)
     for attempt in ended.attempts:
-        print_field(
+        console.print_field(
             "restarted",
             f"{attempt.reason}, at step {attempt.last_step}; resumed from step {attempt.saved_step} "
             f"after {attempt.seconds_to_resume:.1f} s",
@@ -166,15 +155,15 @@ def run_job(
 
 
 def _announce_stop() -> None:
-    error_console.print("Stopping after this step. Press Ctrl-C again to abort immediately.")
+    console.error_console.print("Stopping after this step. Press Ctrl-C again to abort immediately.")
 
 
 def _print_interruption(outputs: Outputs, ended: Ended, command: str) -> None:
     if ended.saved is None:
-        error_console.print(f"Stopped at step {ended.step}. Nothing was saved.")
+        console.error_console.print(f"Stopped at step {ended.step}. Nothing was saved.")
         return
     state = "saved" if ended.saved == ended.step else f"step {ended.saved} is saved"
-    error_console.print(
+    console.error_console.print(
         f"Stopped at step {ended.step} of {ended.total}; {state} in {outputs.checkpoint}.\nTo continue, run:\n{command}"
     )
 
@@ -182,32 +171,36 @@ def _print_interruption(outputs: Outputs, ended: Ended, command: str) -> None:
 def _print_result(outputs: Outputs, result: Result, command: str) -> None:
     assert result.loss_before is not None
     assert result.loss_after is not None
-    print_field("loss", loss_text(result.loss_before, result.loss_after))
-    print_field("loss measured", f"before on {result.loss_views} views, after in the steps of the last round of views")
+    console.print_field("loss", console.loss_text(result.loss_before, result.loss_after))
+    console.print_field(
+        "loss measured", f"before on {result.loss_views} views, after in the steps of the last round of views"
+    )
     if result.loss_over_time and (more := result.loss_over_time["more_time"]):
-        print_field("more time", more["text"])
+        console.print_field("more time", more["text"])
     paths = [("stylized scene", outputs.ply)]
     if outputs.compressed is not None and result.compressed is not None:
-        print_field("compressed", result.compressed)
+        console.print_field("compressed", result.compressed)
         paths.append(("compressed scene", outputs.compressed))
     paths += [("views", outputs.views)] if outputs.views.exists() else []
     if result.report_error is None:
         paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]
         paths += [("report as JSON", outputs.report)]
     for heading, path in paths:
-        print_field(heading, path)
+        console.print_field(heading, path)
     if result.stopped == "within":
-        out_console.print(
+        console.out_console.print(
             f"The time of --within was used up at step {result.steps} of {result.total}. The checkpoint is kept. To "
             f"continue, with as much time again, run:\n{command}"
         )
-    elif result.stopped in EARLY_ENDS:
-        out_console.print(f"Stopped at step {result.steps} of {result.total}: {EARLY_ENDS[result.stopped]}.")
+    elif result.stopped in console.EARLY_ENDS:
+        console.out_console.print(
+            f"Stopped at step {result.steps} of {result.total}: {console.EARLY_ENDS[result.stopped]}."
+        )
     if result.report_error is not None:
-        error_console.print(
+        console.error_console.print(
             f"The stylized scene is complete, but its report could not be written: {result.report_error}"
         )
-        raise typer.Exit(FAILURE)
+        raise typer.Exit(console.FAILURE)
 
 
 class StopFlag:
@@ -242,7 +235,7 @@ class StopFlag:
             self._signal = number
             for other, handler in before.items():
                 signal.signal(other, handler)
-            leave_terminal(number)
+            console.leave_terminal(number)
             announce()
 
         try:
@@ -318,13 +311,13 @@ class _Batch:
             yield
             return
         except typer.Exit as end:
-            if end.exit_code not in (FAILURE, JOB_FAILED):  # interrupted
+            if end.exit_code not in (console.FAILURE, console.JOB_FAILED):  # interrupted
                 raise
         except (SgsstError, OSError, MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not is_out_of_memory(error):
                 raise
             text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
-            error_console.print(f"error: {name}: {text}")
+            console.error_console.print(f"error: {name}: {text}")
         self.failed.append(name)
 
 
@@ -395,12 +388,12 @@ def batch(
                 _make(results, name, request, options, run, context.obj)
     if any(request.out.is_file() for request in jobs.values()):
         _write_sheet(out / _SHEET, jobs, len(style))
-        print_field("contact sheet", out / _SHEET)
+        console.print_field("contact sheet", out / _SHEET)
     if results.failed:
-        error_console.print(
+        console.error_console.print(
             f"{len(results.failed)} of {len(jobs)} results could not be made: {', '.join(results.failed)}"
         )
-        raise typer.Exit(FAILURE)
+        raise typer.Exit(console.FAILURE)
 
 
 def _namesake(path: Path) -> Path:
@@ -409,11 +402,16 @@ def _namesake(path: Path) -> Path:
 
 
 def _make(
-    results: _Batch, name: str, request: JobSpec, options: StylizeOptions, run: RunOptions, invocation: Invocation
+    results: _Batch,
+    name: str,
+    request: JobSpec,
+    options: StylizeOptions,
+    run: RunOptions,
+    invocation: console.Invocation,
 ) -> None:
     """Make a result on this machine, from its checkpoint if there is one."""
     entry = results.entry(name, _inputs(request))
-    print_field("complete" if entry.complete else "result", request.out)
+    console.print_field("complete" if entry.complete else "result", request.out)
     if entry.complete:
         return
     resume = Outputs.of(request.out).checkpoint.exists()
@@ -437,7 +435,7 @@ def _make_by_service(
                 if not entry.complete:
                     waiting[name] = entry = replace(entry, job=_submitted(client, entry.job, name, request, options))
                     results.record(name, entry)
-                print_field("complete" if entry.complete else "job", entry.job or request.out)
+                console.print_field("complete" if entry.complete else "job", entry.job or request.out)
         for name, entry in waiting.items():
             with results.attempt(name):
                 conclude(client, follow(client, entry.job, False), results.result(name), False)
@@ -454,7 +452,7 @@ def _submitted(client: Client, job_id: str, name: str, request: JobSpec, options
             raise
     source, images = request.source, [image.path for image in request.styles]
     parameters = options.model_dump(mode="json", exclude_unset=True)
-    with counting_bar(name) as progress:
+    with console.counting_bar(name) as progress:
         return client.submit(source.scene, images, cameras=source.cameras, progress=progress, **parameters).id
 
 

@@ -12,22 +12,11 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
+from api.http import schemas
 from api.http.context import SESSION_COOKIE, CallerDep, Context, ContextDep, check_origin, check_site, is_id
 from api.http.jobs import INPUT_POLICY, JobId, artifact_file, find_input, input_file
 from api.http.problems import headers, links, raises
 from api.http.receiving import json_body
-from api.http.schemas import (
-    NewShare,
-    SessionView,
-    ShareCreated,
-    SharedView,
-    ShareList,
-    ShareView,
-    SignIn,
-    address,
-    subpath,
-    view_of,
-)
 from api.http.sending import PAGE_HEADERS, ConditionsDep, SentFile, file_answers, send_file, shared_page, shared_policy
 from service import problems
 from service.files.objects import media_type
@@ -62,7 +51,7 @@ async def check_page(request: Request) -> None:
     },
 )
 async def sign_in(
-    request: Request, context: ContextDep, sign_in: Annotated[SignIn, Depends(json_body(SignIn))]
+    request: Request, context: ContextDep, sign_in: Annotated[schemas.SignIn, Depends(json_body(schemas.SignIn))]
 ) -> Response:
     """Sign in: exchange an API key for a session cookie.
 
@@ -87,8 +76,8 @@ async def sign_in(
     return _cookie_answer(request, text, int(context.store.sessions.seconds))
 
 
-@session_router.get("", response_model=SessionView)
-async def get_session(request: Request, context: ContextDep, response: Response) -> SessionView:
+@session_router.get("", response_model=schemas.SessionView)
+async def get_session(request: Request, context: ContextDep, response: Response) -> schemas.SessionView:
     """Get whether a key is required, and whether this browser has a session."""
     response.headers["Cache-Control"] = "no-store"
     cookie = request.cookies.get(SESSION_COOKIE)
@@ -96,7 +85,7 @@ async def get_session(request: Request, context: ContextDep, response: Response)
     within = await asyncio.to_thread(lambda: context.usual_budget)
     if key is not None or not context.settings.keys_required:
         await context.inspector.processes.warm()  # whoever opens the page may create a job soon
-    return SessionView(keys_needed=context.settings.keys_required, signed_in=key is not None, within=within)
+    return schemas.SessionView(keys_needed=context.settings.keys_required, signed_in=key is not None, within=within)
 
 
 @session_router.delete(
@@ -126,7 +115,7 @@ def _cookie_answer(request: Request, text: str, seconds: int) -> Response:
     """
     secure = request.url.scheme == "https" or request.headers.get("origin", "").startswith("https://")
     response = Response(status_code=204, headers={"Cache-Control": "no-store"})
-    path = subpath.get() or "/"
+    path = schemas.subpath.get() or "/"
     response.set_cookie(
         SESSION_COOKIE, text, max_age=seconds, path=path, secure=secure, httponly=True, samesite="strict"
     )
@@ -181,7 +170,7 @@ SharedDep = Annotated[Shared, Depends(get_shared)]
 @router.post(
     "/v1/jobs/{job_id}/shares",
     status_code=201,
-    response_model=ShareCreated,
+    response_model=schemas.ShareCreated,
     responses={
         201: {
             "description": "The link. Its token is not shown again.",
@@ -191,7 +180,10 @@ SharedDep = Annotated[Shared, Depends(get_shared)]
     },
 )
 async def create_share(
-    job_id: JobId, context: ContextDep, caller: CallerDep, new: Annotated[NewShare, Depends(json_body(NewShare))]
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    new: Annotated[schemas.NewShare, Depends(json_body(schemas.NewShare))],
 ) -> Response:
     """Create a read-only link to the result of a job, for people without a key.
 
@@ -203,17 +195,21 @@ async def create_share(
         await context.derived.poster(job, start, caller.quotas)  # a continued job has lost its own
     row, token = await asyncio.to_thread(context.store.shares.create, job_id, caller.owner, new.days * _DAY)
     place = f"/{token}" if new.poster else f"#{token}"
-    view = ShareCreated(**view_of(ShareView, row).model_dump(), url=address(f"/shared{place}"), embed_url=None)
+    view = schemas.ShareCreated(
+        **schemas.view_of(schemas.ShareView, row).model_dump(), url=schemas.address(f"/shared{place}"), embed_url=None
+    )
     if context.settings.embed_origins:
-        view.embed_url = address(f"/shared{place}?embed=1" if new.poster else f"/shared?embed=1{place}")
+        view.embed_url = schemas.address(f"/shared{place}?embed=1" if new.poster else f"/shared?embed=1{place}")
     return Response(view.model_dump_json(), 201, {"Cache-Control": "no-store"}, media_type="application/json")
 
 
-@router.get("/v1/jobs/{job_id}/shares", response_model=ShareList)
-def list_shares(job_id: JobId, context: ContextDep, caller: CallerDep) -> ShareList:
+@router.get("/v1/jobs/{job_id}/shares", response_model=schemas.ShareList)
+def list_shares(job_id: JobId, context: ContextDep, caller: CallerDep) -> schemas.ShareList:
     """List the links to the result of a job that have not expired. Their tokens are not stored."""
     context.store.jobs.get(job_id, caller.owner)
-    return ShareList(shares=[view_of(ShareView, row) for row in context.store.shares.of_job(job_id)])
+    return schemas.ShareList(
+        shares=[schemas.view_of(schemas.ShareView, row) for row in context.store.shares.of_job(job_id)]
+    )
 
 
 @router.delete(
@@ -236,7 +232,7 @@ def revoke_share(
 
 @router.get(
     "/v1/shared/{token}",
-    response_model=SharedView,
+    response_model=schemas.SharedView,
     responses={200: {"headers": headers("Cache-Control", "Referrer-Policy")}},
     operation_id="get_shared",
 )
@@ -248,7 +244,7 @@ async def show_shared(shared: SharedDep, context: ContextDep) -> Response:
     return Response(view.model_dump_json(), headers=_SECRET, media_type="application/json")
 
 
-def _shared_view(context: Context, shared: Shared) -> tuple[SharedView, ArtifactRow | None]:
+def _shared_view(context: Context, shared: Shared) -> tuple[schemas.SharedView, ArtifactRow | None]:
     """Return the public view of a shared job, only what the page needs to show it, and the row of the job's plan.
 
     Raises:
@@ -261,7 +257,7 @@ def _shared_view(context: Context, shared: Shared) -> tuple[SharedView, Artifact
         plan = jobs.artifact(job_id, "plan.json")
     except NotFoundError:
         raise problems.NO_SHARE() from None
-    view = SharedView(
+    view = schemas.SharedView(
         name=job.row.name,
         expires_at=shared.share.expires_at,
         parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters},
@@ -303,7 +299,7 @@ def _preview_tags(request: Request, context: Context, shared: Shared, token: str
     """Return the tags of the Open Graph protocol, whose addresses are absolute."""
     tags = {"og:type": "website", "og:title": shared.job.name}
     if _result(context, shared.job.id, "poster"):
-        poster = address(f"/v1/shared/{token}/poster")
+        poster = schemas.address(f"/v1/shared/{token}/poster")
         tags |= {
             "og:image": f"{request.url.scheme}://{request.url.netloc}{poster}",
             "twitter:card": "summary_large_image",

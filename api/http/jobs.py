@@ -22,32 +22,10 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import AfterValidator, BaseModel
 from pydantic_core import to_jsonable_python
 
+from api.http import schemas
 from api.http.context import Caller, CallerDep, Context, ContextDep, Digits, is_id
 from api.http.problems import from_service, headers, links
 from api.http.receiving import json_body
-from api.http.schemas import (
-    MOST_POINTS,
-    ArtifactList,
-    ArtifactView,
-    BlendRequest,
-    InputFileView,
-    InputList,
-    JobChange,
-    JobDetail,
-    JobPage,
-    JobView,
-    PlanView,
-    ProgressHistory,
-    ProgressView,
-    StatusName,
-    artifact_view,
-    example_of,
-    input_view,
-    job_detail,
-    job_view,
-    poll_seconds,
-    utc,
-)
 from api.http.sending import ConditionsDep, IfNoneMatch, SentFile, file_answers, names_etag, send_file, send_list
 from api.static_files import exported_viewer
 from service import problems
@@ -205,7 +183,7 @@ class Hub:
 def _sent(row: EventRow) -> _Sent:
     data = row.data
     if row.kind == "progress":  # same format as in responses that show the job
-        data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
+        data = {**data, "updated_at": to_jsonable_python(schemas.utc(data["updated_at"]))}
     text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
     return _Sent(row.id, text.encode(), _ends(row))
 
@@ -236,7 +214,7 @@ def _work_documentation(model: type[BaseModel], description: str, progress: str,
 
 #: Documentation of the responses for the OpenAPI document.
 DRY_RUN = _work_documentation(
-    PlanView,
+    schemas.PlanView,
     "With `dry_run`: the plan. Nothing was queued. With `Accept: text/event-stream`, events: `planning`, the stage "
     "(`planning` or `refining`) and its number of completed views (`total` is 0 if it has none); finally "
     "`plan`, or a `problem` that occurred after the response started.",
@@ -244,7 +222,7 @@ DRY_RUN = _work_documentation(
     "plan",
 )
 VIDEO = _work_documentation(
-    ArtifactView,
+    schemas.ArtifactView,
     "The video, which has been rendered. With `Accept: text/event-stream`, events: `rendering`, the number of rendered "
     "frames; finally `video`, or a `problem` that occurred after the response started.",
     "rendering",
@@ -372,14 +350,14 @@ def _documented(*following: str, **more: str) -> dict[str, Any]:
 
 @router.get(
     "",
-    response_model=JobPage,
+    response_model=schemas.JobPage,
     responses={200: {"links": links(*FOLLOWING_OPERATIONS, job_id="$response.body#/jobs/0/id")}},
 )
 async def list_jobs(
     context: ContextDep,
     caller: CallerDep,
     status: Annotated[
-        list[StatusName] | None,
+        list[schemas.StatusName] | None,
         Query(description="Show only jobs with this status; may be repeated.", examples=[["queued", "running"]]),
     ] = None,
     cursor: Annotated[
@@ -389,17 +367,17 @@ async def list_jobs(
 ) -> Response:
     """List the jobs of this key, newest first."""
 
-    def read(before: str | None, most: int) -> tuple[list[JobView], str | None]:
+    def read(before: str | None, most: int) -> tuple[list[schemas.JobView], str | None]:
         page = context.store.jobs.page(caller.owner, status=status or (), before=before, limit=most + 1)
         following = page[most - 1].row.id if len(page) > most else None  # one more shows if more follow
-        return [job_view(job) for job in page[:most]], following
+        return [schemas.job_view(job) for job in page[:most]], following
 
     return await send_list("jobs", read, cursor, limit, context.readers.of(caller.owner), at_once=16)
 
 
 @router.get(
     "/{job_id}",
-    response_model=JobDetail,
+    response_model=schemas.JobDetail,
     responses={
         200: _documented(*FOLLOWING_OPERATIONS[1:]),
         304: {"description": "Nothing has changed since the ETag of `If-None-Match`.", "headers": _SHOWN},
@@ -412,11 +390,14 @@ def get_job(job_id: JobId, context: ContextDep, caller: CallerDep, if_none_match
 
 @router.patch(
     "/{job_id}",
-    response_model=JobDetail,
+    response_model=schemas.JobDetail,
     responses={200: _documented(*FOLLOWING_OPERATIONS[1:])},
 )
 async def change_job(
-    job_id: JobId, context: ContextDep, caller: CallerDep, change: Annotated[JobChange, Depends(json_body(JobChange))]
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    change: Annotated[schemas.JobChange, Depends(json_body(schemas.JobChange))],
 ) -> Response:
     """Rename a job, whatever its status, or set the viewpoints of a finished one."""
     job = await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
@@ -436,16 +417,16 @@ def _rename(context: Context, caller: Caller, job_id: str, name: str) -> None:
     context.store.jobs.rename(job_id, caller.owner, name)
 
 
-@router.get("/{job_id}/progress", response_model=ProgressHistory)
-def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
+@router.get("/{job_id}/progress", response_model=schemas.ProgressHistory)
+def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> schemas.ProgressHistory:
     """Get the loss history of a job from its first step on, while it runs and after its end."""
-    points = context.store.jobs.loss_history(context.store.jobs.get(job_id, caller.owner), MOST_POINTS)
-    return ProgressHistory.model_validate({"points": points})
+    points = context.store.jobs.loss_history(context.store.jobs.get(job_id, caller.owner), schemas.MOST_POINTS)
+    return schemas.ProgressHistory.model_validate({"points": points})
 
 
 @router.post(
     "/{job_id}/finish",
-    response_model=JobDetail,
+    response_model=schemas.JobDetail,
     responses={200: _documented("get_job", "cancel_job", "watch_job", "list_artifacts")},
 )
 def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
@@ -456,7 +437,7 @@ def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
 
 @router.post(
     "/{job_id}/cancel",
-    response_model=JobDetail,
+    response_model=schemas.JobDetail,
     responses={200: _documented("get_job", "retry_job", "delete_job", "watch_job")},
 )
 def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
@@ -468,7 +449,7 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
 @router.post(
     "/{job_id}/retry",
     status_code=202,
-    response_model=JobDetail,
+    response_model=schemas.JobDetail,
     responses={202: _documented("get_job", "cancel_job", "list_artifacts", description="The job is queued again.")},
 )
 def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
@@ -491,10 +472,10 @@ def _job_response(
     context: Context, caller: Caller, job_id: str, if_none_match: str | None = None, status: int = 200
 ) -> Response:
     job, attempts = context.store.jobs.detail(job_id, caller.owner)
-    body = job_detail(job, attempts).model_dump_json().encode()
+    body = schemas.job_detail(job, attempts).model_dump_json().encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     response_headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    wait = poll_seconds(job.row)
+    wait = schemas.poll_seconds(job.row)
     if wait is not None:
         response_headers["Retry-After"] = str(wait)
     if names_etag(if_none_match, tag):
@@ -514,7 +495,7 @@ _EVENT = {
 }
 _EXAMPLES = {
     "status": {"status": "running", "attempt": 1},
-    "progress": example_of(ProgressView),
+    "progress": schemas.example_of(schemas.ProgressView),
     "artifact": {"name": "previews/step_0000100.jpg", "size": 41239, "sha256": SHA256},
 }
 
@@ -592,7 +573,7 @@ _INPUT_ANSWERS = file_answers(_INPUT_CONTENT, always_policy=True)
 
 @inputs_router.get(
     "/{job_id}/inputs",
-    response_model=InputList,
+    response_model=schemas.InputList,
     responses={
         200: {
             "links": links(
@@ -611,11 +592,11 @@ async def list_inputs(
     """List the files that a job was created from, photos and masks included."""
     await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
 
-    def read(start: str | None, most: int) -> tuple[list[InputFileView], str | None]:
+    def read(start: str | None, most: int) -> tuple[list[schemas.InputFileView], str | None]:
         position = int(start or 0)
         page = context.store.jobs.input_page(job_id, position, most + 1)
         following = str(position + most) if len(page) > most else None
-        return [input_view(job_id, *entry) for entry in page[:most]], following
+        return [schemas.input_view(job_id, *entry) for entry in page[:most]], following
 
     return await send_list("inputs", read, str(cursor), limit, context.readers.of(caller.owner))
 
@@ -712,7 +693,7 @@ _SANDBOX = (
 
 @artifacts_router.get(
     "/{job_id}/artifacts",
-    response_model=ArtifactList,
+    response_model=schemas.ArtifactList,
     responses={
         200: {
             "links": links(
@@ -733,10 +714,10 @@ async def list_artifacts(
     """List the files that a job has made so far, by name. A running job has its plan and previews."""
     await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
 
-    def read(after: str | None, most: int) -> tuple[list[ArtifactView], str | None]:
+    def read(after: str | None, most: int) -> tuple[list[schemas.ArtifactView], str | None]:
         page = context.store.jobs.artifacts(job_id, after or "", most + 1)
         following = page[most - 1].name if len(page) > most else None
-        return [artifact_view(row) for row in page[:most] if not row.name.startswith(".")], following
+        return [schemas.artifact_view(row) for row in page[:most] if not row.name.startswith(".")], following
 
     return await send_list("artifacts", read, cursor, limit, context.readers.of(caller.owner))
 
@@ -821,7 +802,7 @@ def artifact_file(context: Context, owner: str, row: ArtifactRow, name: str, kin
 @artifacts_router.post(
     "/{job_id}/blends",
     status_code=201,
-    response_model=ArtifactView,
+    response_model=schemas.ArtifactView,
     responses={
         201: {
             "description": "The blend exists. The same request returns the same file.",
@@ -834,7 +815,7 @@ async def create_blend(
     job_id: JobId,
     context: ContextDep,
     caller: CallerDep,
-    body: Annotated[BlendRequest, Depends(json_body(BlendRequest))],
+    body: Annotated[schemas.BlendRequest, Depends(json_body(schemas.BlendRequest))],
 ) -> Response:
     """Blend a finished job's scene with its result, and store the blend among the job's artifacts."""
     others = {part.job_id: part.weight for part in body.others}
@@ -844,11 +825,11 @@ async def create_blend(
         await asyncio.to_thread(context.store.jobs.get, other, caller.owner)
     job = await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
     row = await context.derived.blended(job, Blend(body.weight, others, by_name(body.format)), caller.quotas)
-    view = artifact_view(row)
+    view = schemas.artifact_view(row)
     return Response(view.model_dump_json(), 201, {"Location": view.url}, media_type="application/json")
 
 
-@artifacts_router.post("/{job_id}/video", response_model=ArtifactView, responses={200: VIDEO})
+@artifacts_router.post("/{job_id}/video", response_model=schemas.ArtifactView, responses={200: VIDEO})
 async def make_video(
     request: Request,
     job_id: JobId,
@@ -862,7 +843,7 @@ async def make_video(
     """
     job = await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
 
-    async def work(show: Any) -> ArtifactView:
-        return artifact_view(await context.derived.video(job, options, caller.quotas, show))
+    async def work(show: Any) -> schemas.ArtifactView:
+        return schemas.artifact_view(await context.derived.video(job, options, caller.quotas, show))
 
     return await answer_work(request, work, "rendering", "video", context.hub.working)

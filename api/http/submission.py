@@ -20,23 +20,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from api.http import receiving
 from api.http.context import Caller, CallerDep, Context, ContextDep, Digits, is_id
 from api.http.jobs import DRY_RUN, FOLLOWING_OPERATIONS, answer_work, parse_input
 from api.http.problems import headers, links, raises
-from api.http.receiving import (
-    MAX_TEXT,
-    Receipt,
-    Received,
-    body_blocks,
-    check_media_type,
-    file_name,
-    is_url,
-    media_type,
-    most_files,
-    parse_json,
-    read_json,
-    receive,
-)
 from api.http.schemas import JobView, PlanView, UploadView, address, job_view, subpath, upload_view
 from service import problems
 from service.deadlines import suspended
@@ -114,7 +101,7 @@ def check_protocol(
         if value in request.headers.get(header, "").lower() and header in request.headers:
             raise problems.TUS_EXTENSION(header=header, extension=extension, supported=EXTENSIONS)
     empty = request.headers.get("content-length", "0") == "0" and "transfer-encoding" not in request.headers
-    if request.method == "POST" and media_type(request) == _PART_TYPE and not empty:
+    if request.method == "POST" and receiving.media_type(request) == _PART_TYPE and not empty:
         raise problems.TUS_EXTENSION(header="Content-Type", extension="creation-with-upload", supported=EXTENSIONS)
 
 
@@ -296,7 +283,7 @@ async def append_upload(
     ] = None,
 ) -> Response:
     """Send the next part. If the connection breaks, received bytes are stored unless a checksum was announced."""
-    check_media_type(request, _PART_TYPE)
+    receiving.check_media_type(request, _PART_TYPE)
     expected = _parse_checksum(checksum) if checksum else None
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     if row.sha256 is not None and offset != row.length:
@@ -309,7 +296,7 @@ async def append_upload(
     elif row.sha256 is None:
         expires = await _append_body(request, context, row, expected)
     else:
-        async for _ in body_blocks(request, context.settings):
+        async for _ in receiving.body_blocks(request, context.settings):
             raise _longer_than_declared(row.length)
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     response_headers = {"Upload-Offset": str(row.offset), "Upload-Expires": formatdate(expires, usegmt=True)}
@@ -341,7 +328,7 @@ async def _append_body(request: Request, context: Context, row: UploadRow, check
     writer = await run(_Writer, context, row, checksum)
     try:
         try:
-            async for block in body_blocks(request, context.settings):
+            async for block in receiving.body_blocks(request, context.settings):
                 await run(writer.write, block, size=_SAVE_BYTES)
         except StoreError:
             raise
@@ -602,8 +589,8 @@ async def create_job(
 ) -> Response:
     """Queue a job. All files are read and checked before the answer; unusable ones are refused with 422."""
     async with AsyncExitStack() as stack:
-        receipt = await stack.enter_async_context(Receipt(context.receipts, caller.owner, caller.quotas))
-        is_json = media_type(request) == "application/json"
+        receipt = await stack.enter_async_context(receiving.Receipt(context.receipts, caller.owner, caller.quotas))
+        is_json = receiving.media_type(request) == "application/json"
         reading = _from_json(request, context) if is_json else _from_form(request, context, receipt)
         received, parameters, webhook = await reading
         find_inputs = partial(_find_inputs, context, caller, received, parameters, webhook)
@@ -637,7 +624,7 @@ async def create_job(
 def _find_inputs(
     context: Context,
     caller: Caller,
-    received: Received,
+    received: receiving.Received,
     parameters: JobParameters,
     webhook: Webhook,
     fetched: Mapping[str, str],
@@ -672,7 +659,7 @@ def _queue_job(
     parameters: JobParameters,
     webhook: Webhook,
     idempotency: Idempotency | None,
-    receipt: Receipt,
+    receipt: receiving.Receipt,
 ) -> Response:
     """Queue a checked job, and return the response."""
     values = parameters.model_dump(mode="json", exclude_unset=True)
@@ -693,13 +680,13 @@ def _queue_job(
 
 
 #: Files and texts of a request, with the parameters and the webhook of the job.
-_Parts = tuple[Received, JobParameters, Webhook]
+_Parts = tuple[receiving.Received, JobParameters, Webhook]
 
 
-async def _from_form(request: Request, context: Context, receipt: Receipt) -> _Parts:
-    received = await receive(request, context.blobs, context.settings, receipt, context.threads)
+async def _from_form(request: Request, context: Context, receipt: receiving.Receipt) -> _Parts:
+    received = await receiving.receive(request, context.blobs, context.settings, receipt, context.threads)
     text = received.texts.get("parameters", "").strip() or "{}"
-    values = parse_json(text, "parameters")
+    values = receiving.parse_json(text, "parameters")
     if not isinstance(values, dict):
         raise problems.INVALID_REQUEST("parameters: is not a JSON object.", input="parameters")
     parameters = JobParameters.model_validate(values)
@@ -711,21 +698,21 @@ async def _from_form(request: Request, context: Context, receipt: Receipt) -> _P
 
 
 async def _from_json(request: Request, context: Context) -> _Parts:
-    job = JobFromUploads.model_validate(await read_json(request, context.settings, _MAX_JSON))
+    job = JobFromUploads.model_validate(await receiving.read_json(request, context.settings, _MAX_JSON))
     job.parameters.settings()
-    if len(job.parameters.model_dump_json(exclude_unset=True)) > MAX_TEXT:
-        raise problems.INVALID_REQUEST(f"parameters: has more than {MAX_TEXT} bytes.", input="parameters")
+    if len(job.parameters.model_dump_json(exclude_unset=True)) > receiving.MAX_TEXT:
+        raise problems.INVALID_REQUEST(f"parameters: has more than {receiving.MAX_TEXT} bytes.", input="parameters")
     styles = [job.style] if isinstance(job.style, str) else job.style
     named = [("scene", job.scene), *(("style", each) for each in styles)]
     named += [(role, each) for role in ("cameras", "photos", "mask", "painted") for each in getattr(job, role)]
-    if len(named) > (most := most_files(context.settings)):
+    if len(named) > (most := receiving.most_files(context.settings)):
         raise problems.TOO_MANY_FILES(limit=most, what="files")
     uploads = [(index, *each) for index, each in enumerate(named)]
-    return Received(uploads=uploads), job.parameters, job
+    return receiving.Received(uploads=uploads), job.parameters, job
 
 
 def _resolve_inputs(
-    context: Context, caller: Caller, received: Received, fetched: Mapping[str, str]
+    context: Context, caller: Caller, received: receiving.Received, fetched: Mapping[str, str]
 ) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
     """Return the entries of all files of a job, and their blobs by digest.
 
@@ -738,8 +725,8 @@ def _resolve_inputs(
     released: dict[str, bool] = {}
     resolved: list[tuple[str, str]] = []
     for _, role, text in received.uploads:
-        if is_url(text):
-            resolved.append((file_name(text), fetched.get(text, "")))
+        if receiving.is_url(text):
+            resolved.append((receiving.file_name(text), fetched.get(text, "")))
         elif text in fetched:
             resolved.append((RESULT, fetched[text]))
         elif reference := _PATH.fullmatch(text.removeprefix(subpath.get())):
@@ -759,7 +746,9 @@ def _resolve_inputs(
     return inputs, rows
 
 
-async def _adopt_results(context: Context, caller: Caller, received: Received, receipt: Receipt) -> dict[str, str]:
+async def _adopt_results(
+    context: Context, caller: Caller, received: receiving.Received, receipt: receiving.Receipt
+) -> dict[str, str]:
     """Turn results of the caller's jobs that a request names into blobs, and return their SHA-256 by path.
 
     Raises:
@@ -772,7 +761,7 @@ async def _adopt_results(context: Context, caller: Caller, received: Received, r
     return {path: await run(row, size=row.size) for path, row in results.items()}
 
 
-def _referred_results(context: Context, caller: Caller, received: Received) -> dict[str, ArtifactRow]:
+def _referred_results(context: Context, caller: Caller, received: receiving.Received) -> dict[str, ArtifactRow]:
     results = {}
     for _, role, text in received.uploads:
         if reference := _RESULT_PATH.fullmatch(text.removeprefix(subpath.get())):
@@ -785,7 +774,7 @@ def _referred_results(context: Context, caller: Caller, received: Received) -> d
     return results
 
 
-def _adopt_result(context: Context, receipt: Receipt, row: ArtifactRow) -> str:
+def _adopt_result(context: Context, receipt: receiving.Receipt, row: ArtifactRow) -> str:
     receipt.charge(row.size)
     context.blobs.ensure_space(row.size)
     copy = context.blobs.incoming / f"{secrets.token_hex(12)}.part"

@@ -25,17 +25,9 @@ from service.files.objects import Artifacts, ObjectStore
 from service.inputs import CHECKPOINT, PLAN, job_spec, layout, stage, stored_parameters
 from service.inspection.inspector import stored_plan
 from service.problems import LeaseLostError
+from service.scheduling import messages
 from service.scheduling.attempt_files import PATIENCE_SECONDS, Publisher, fetch_checkpoint, store_weights
 from service.scheduling.capacity import Grant
-from service.scheduling.messages import (
-    Ending,
-    Report,
-    StopRequest,
-    StoreWorkplace,
-    Task,
-    attempt_ending,
-    failure,
-)
 from service.settings import ServiceSettings
 from service.states import AttemptOutcome, JobStatus, Published
 from service.store import Store
@@ -75,7 +67,7 @@ class ChildProcess:
                 env=environment,
                 start_new_session=True,
             )
-        self.reports: queue.Queue[Report | None] = queue.Queue()
+        self.reports: queue.Queue[messages.Report | None] = queue.Queue()
         self._deadline: float | None = None
         self._finishing = False
         threading.Thread(target=self._listen, name=f"{folder.name}-out", daemon=True).start()
@@ -84,7 +76,7 @@ class ChildProcess:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             with contextlib.suppress(ValueError):
-                self.reports.put(Report.model_validate_json(line))
+                self.reports.put(messages.Report.model_validate_json(line))
         self.reports.put(None)
 
     def finish(self) -> None:
@@ -154,7 +146,7 @@ def prepare(
     of_job = spec.settings
     if grant.memory is not None:
         of_job = of_job.model_copy(update={"memory_limit": grant.memory})
-    task = Task(
+    task = messages.Task(
         spec=spec.model_copy(update={"settings": of_job, "resume": checkpoint is not None}),
         workers=grant.ranks,
         cluster=cluster,
@@ -167,14 +159,16 @@ def prepare(
 
 def _workplace(
     objects: ObjectStore, lease: Lease, rows: Mapping[str, BlobRow], checkpoint: ArtifactRow | None
-) -> StoreWorkplace:
+) -> messages.StoreWorkplace:
     """Return the description that ranks on other machines need to stage the job's files."""
     files = [Published(sha256, f"{BLOBS}/{row.location}", row.size, sha256) for sha256, row in rows.items()]
     saved = None
     if checkpoint is not None:
         saved = Published(CHECKPOINT, checkpoint.location, checkpoint.size, checkpoint.sha256)
     weights = store_weights(objects)
-    return StoreWorkplace(objects.url, lease.job_id, lease.epoch, tuple(lease.job.inputs), tuple(files), saved, weights)
+    return messages.StoreWorkplace(
+        objects.url, lease.job_id, lease.epoch, tuple(lease.job.inputs), tuple(files), saved, weights
+    )
 
 
 #: Time that a canceled job has to finish its step, in seconds.
@@ -213,7 +207,7 @@ class RunningAttempt:
         self._folder, self._settings, self._store = folder, settings, store
         self._prepare, self._cluster = prepare, cluster
         self._process: ChildProcess | None = None
-        self._stop_request: StopRequest | None = None
+        self._stop_request: messages.StopRequest | None = None
         self._publisher = Publisher(lease, folder, store, artifacts, settings.preview_seconds)
         self._progress = ProgressWriter(lease, store)
         # Work on files has a thread of its own, because it may hang: the attempt then ends without it.
@@ -230,22 +224,22 @@ class RunningAttempt:
     @property
     def abandoned(self) -> bool:
         """Whether the attempt was abandoned or has ended."""
-        return self._stop_request == StopRequest.ABANDON or not self.alive
+        return self._stop_request == messages.StopRequest.ABANDON or not self.alive
 
     def obey(self, status: JobStatus) -> None:
         """Do what the job's status asks for on behalf of its user: stop, or end with the present colors as result."""
         if status == JobStatus.CANCELING:
-            self._stop_request = self._stop_request or StopRequest.CANCEL
+            self._stop_request = self._stop_request or messages.StopRequest.CANCEL
         elif status == JobStatus.FINISHING and self._process is not None:
             self._process.finish()
 
     def release(self) -> None:
         """Save the job's state and return it to the queue, because the dispatcher is shutting down."""
-        self._stop_request = self._stop_request or StopRequest.RELEASE
+        self._stop_request = self._stop_request or messages.StopRequest.RELEASE
 
     def abandon(self) -> None:
         """End everything at once and write nothing more: another dispatcher has the job or may get it soon."""
-        self._stop_request = StopRequest.ABANDON
+        self._stop_request = messages.StopRequest.ABANDON
         self._kill()  # the attempt's own thread may be waiting for a database that does not respond
 
     # --- in the attempt's thread ----------------------------------------------------------------------------------
@@ -257,7 +251,7 @@ class RunningAttempt:
             _log.warning("lease lost to another dispatcher", extra=self.lease.log_fields)
         except Exception as error:
             _log.exception("attempt failed", extra=self.lease.log_fields)
-            ending = failure(error)
+            ending = messages.failure(error)
             with contextlib.suppress(Exception):
                 self._fail(ending.error or {}, permanent=ending.permanent)
         finally:
@@ -295,13 +289,13 @@ class RunningAttempt:
         self._process = ChildProcess(self._folder, self.grant, cluster=self._cluster)
         _log.info("attempt started", extra=self.lease.log_fields)
         reported = self._watch(self._process)
-        if self._stop_request == StopRequest.ABANDON:
+        if self._stop_request == messages.StopRequest.ABANDON:
             return
         exit_code = self._process.wait()
         self._progress.write(now=True)
         self._within(partial(self._publisher.publish_unfinished, whole_log=True), PATIENCE_SECONDS)
         self._check_published()
-        ending = attempt_ending(
+        ending = messages.attempt_ending(
             self._stop_request,
             reported,
             exit_code,
@@ -311,11 +305,13 @@ class RunningAttempt:
         )
         self._conclude(ending)
 
-    def _conclude(self, ending: Ending) -> None:
+    def _conclude(self, ending: messages.Ending) -> None:
         """Record the end of an attempt in the store."""
         if ending.outcome == AttemptOutcome.SUCCEEDED:
             result = {} if ending.result is None else ending.result.model_dump()
-            succeed = partial(self._publisher.succeed, result, lambda: self._stop_request == StopRequest.ABANDON)
+            succeed = partial(
+                self._publisher.succeed, result, lambda: self._stop_request == messages.StopRequest.ABANDON
+            )
             self._within(succeed, 2 * PATIENCE_SECONDS)
         elif ending.outcome == AttemptOutcome.CANCELED:
             self._store.leases.stop(self.lease)
@@ -328,9 +324,9 @@ class RunningAttempt:
             return
         _log.info("attempt ended: outcome=%s", ending.outcome, extra=self.lease.log_fields)
 
-    def _watch(self, process: ChildProcess) -> Ending | None:
+    def _watch(self, process: ChildProcess) -> messages.Ending | None:
         """Handle reports until the process ends or the attempt is abandoned; return the reported ending, or None."""
-        ending: Ending | None = None
+        ending: messages.Ending | None = None
         ended = False
         while not ended:
             with contextlib.suppress(queue.Empty):
@@ -340,7 +336,7 @@ class RunningAttempt:
                     self._handle(report)
                     report = process.reports.get_nowait()
                 ended = True
-            if self._stop_request == StopRequest.ABANDON:
+            if self._stop_request == messages.StopRequest.ABANDON:
                 process.kill()
                 return None
             self._progress.write()
@@ -349,11 +345,13 @@ class RunningAttempt:
                 self._pending.append(self._files.submit(self._publisher.publish_unfinished))
             if self._stop_request is not None:
                 process.stop(
-                    _CANCEL_SECONDS if self._stop_request == StopRequest.CANCEL else self._settings.stop_seconds
+                    _CANCEL_SECONDS
+                    if self._stop_request == messages.StopRequest.CANCEL
+                    else self._settings.stop_seconds
                 )
         return ending
 
-    def _handle(self, report: Report) -> None:
+    def _handle(self, report: messages.Report) -> None:
         """Handle a report, except for its ending."""
         if report.stored is not None:
             self._pending.append(self._files.submit(self._publisher.publish, [report.stored]))

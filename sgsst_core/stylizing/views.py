@@ -8,23 +8,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from sgsst_core import parallel
 from sgsst_core.budget import Cache
 from sgsst_core.devices import Timer
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import ContentFeatures, ViewTarget
-from sgsst_core.parallel import (
-    ALONE,
-    Collectives,
-    Divider,
-    Division,
-    ImageExchange,
-    Piece,
-    ScaledView,
-    Shares,
-    ViewImages,
-)
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions import ContentMaps, RegionMaps
 from sgsst_core.scene.camera import Camera
@@ -83,7 +73,7 @@ class Views:
         memory: int = 1 << 30,
         clamp_aware_gradient: bool = False,
         regions: Sequence[Rectangle] | None = None,
-        divider: Divider | None = None,
+        divider: parallel.Divider | None = None,
         timer: Timer | None = None,
     ) -> None:
         self.scene = scene
@@ -91,11 +81,11 @@ class Views:
         self.rasterizer = rasterizer
         self.covered = covered
         self.clamp_aware_gradient = clamp_aware_gradient
-        self.collectives: Collectives = divider.collectives if divider else ALONE
+        self.collectives: parallel.Collectives = divider.collectives if divider else parallel.ALONE
         self.timer = timer or Timer()
         self._divider = divider
         self._regions = regions
-        self._shares: dict[int, Shares] = {}
+        self._shares: dict[int, parallel.Shares] = {}
         self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4)
         self._sh_dc = scene.sh_dc.to(rasterizer.device)
 
@@ -134,11 +124,11 @@ class Views:
         image = own.new_zeros((*shares.size, *own.shape[2:]))
         with self.timer("communication"):
             everything = Rectangle(0, 0, *shares.size)
-            exchange = ImageExchange(shares.parts, [everything] * self.collectives.size)
+            exchange = parallel.ImageExchange(shares.parts, [everything] * self.collectives.size)
             self.collectives.gather_parts([exchange], [own], [image])
         return image
 
-    def shares(self, index: int) -> Shares | None:
+    def shares(self, index: int) -> parallel.Shares | None:
         """Return the rectangles of a view that the ranks render; None for a single rank."""
         if self._divider is None or self.collectives.size == 1:
             return None
@@ -301,11 +291,11 @@ class ViewTargets:
             memory // 4 if has_maps else 0, lambda every: sum(map(_pyramid_bytes, every))
         )
         # Whole scaled views count, so that all ranks agree on what fits.
-        self._images: Cache[_ContentKey, ScaledView] = Cache(
+        self._images: Cache[_ContentKey, parallel.ScaledView] = Cache(
             images, lambda view: view.size[0] * view.size[1] * 3 * view.image.itemsize
         )
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
-        self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
+        self._divisions: dict[tuple[int, tuple[int, ...]], parallel.Division] = {}
 
     def target(self, index: int, scales: Sequence[int], background: Color | None = None) -> ViewTarget:
         """Return the target of a view at some scales; cached if it fits.
@@ -328,7 +318,9 @@ class ViewTargets:
         # Every rank has the whole of a photo.
         whole = division if self.photos is None else replace(division, shares=None)
         images = functools.cache(
-            lambda: ViewImages(self.content(index), whole, self._background, self.loss.collectives, self.loss.timer)
+            lambda: parallel.ViewImages(
+                self.content(index), whole, self._background, self.loss.collectives, self.loss.timer
+            )
         )
 
         def features(scale: int) -> ContentFeatures:
@@ -390,7 +382,7 @@ class ViewTargets:
         self._divisions.clear()
         self.views.forget_shares()
 
-    def _content_over(self, index: int, content: ScaledView, color: Color) -> ScaledView:
+    def _content_over(self, index: int, content: parallel.ScaledView, color: Color) -> parallel.ScaledView:
         """Return the content of a view at a scale with another background color.
 
         In a photo, the color replaces everything that no Gaussian covers.
@@ -404,7 +396,7 @@ class ViewTargets:
             image, present = image * coverage[..., None].to(image.dtype), (0.0, 0.0, 0.0)
         return replace(content, image=replace_background(image, coverage, color, present))
 
-    def _division(self, index: int, scales: Sequence[int], coverage: list[Tensor] | None) -> Division:
+    def _division(self, index: int, scales: Sequence[int], coverage: list[Tensor] | None) -> parallel.Division:
         """Return the division of work on some scales of a view.
 
         It is computed once, because it requires reading the coverage.
@@ -427,7 +419,7 @@ class ViewTargets:
 
 
 #: Index of the view, scale, and every rank's pieces of it.
-_ContentKey = tuple[int, int, tuple[tuple[Piece, ...], ...]]
+_ContentKey = tuple[int, int, tuple[tuple[parallel.Piece, ...], ...]]
 
 
 def _pyramid_bytes(pyramid: list[Tensor]) -> int:

@@ -28,28 +28,7 @@ from numpy.typing import NDArray
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import refuse_changed_meaning
-from sgsst_core.files.formats.scene_format import (
-    COEFFICIENTS,
-    WRONG_JSON,
-    Y_UP,
-    Arrays,
-    FileStart,
-    Frame,
-    OpenScene,
-    RenderTag,
-    SceneFormat,
-    SceneHeader,
-    blocks,
-    extras_of,
-    extras_tag,
-    json_numbers,
-    logarithms,
-    logits,
-    read_bytes,
-    read_rows,
-    truncated,
-    whole_number,
-)
+from sgsst_core.files.formats import scene_format
 from sgsst_core.scene.rendering import Rendering
 
 _MAGIC = b"glTF"
@@ -126,19 +105,19 @@ class GlbPart:
     count: int
     accessors: dict[str, Accessor]
     harmonics: list[Accessor]
-    frame: Frame
-    tag: RenderTag
+    frame: scene_format.Frame
+    tag: scene_format.RenderTag
     linear: bool
 
 
 @dataclass(frozen=True)
-class GlbHeader(SceneHeader):
+class GlbHeader(scene_format.SceneHeader):
     """Header of a GLB scene, which consists of `parts`."""
 
     parts: list[GlbPart]
 
 
-def _read_header(start: FileStart) -> GlbHeader:
+def _read_header(start: scene_format.FileStart) -> GlbHeader:
     path = start.path
     text, data = _chunks(start)
     try:
@@ -157,7 +136,7 @@ def _read_header(start: FileStart) -> GlbHeader:
         notes += ["animations are left out"] if document.get("animations") else []
         linear = "colors are linear, and converted to sRGB for each Gaussian; where Gaussians overlap, renders differ"
         notes += [linear] if any(part.linear for part in parts) else []
-    except WRONG_JSON as error:
+    except scene_format.WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
     count = sum(part.count for part in parts)
     if count > len(data):
@@ -168,7 +147,7 @@ def _read_header(start: FileStart) -> GlbHeader:
     return GlbHeader(GLB, count, coefficients, parts, notes=tuple(notes), tag=parts[0].tag)
 
 
-def _chunks(start: FileStart) -> tuple[bytes, range]:
+def _chunks(start: scene_format.FileStart) -> tuple[bytes, range]:
     """Return the JSON document, and the byte offsets of the binary data."""
     path = start.path
     head = start.head.ljust(_HEADER.size + _CHUNK.size, b"\0")
@@ -176,20 +155,23 @@ def _chunks(start: FileStart) -> tuple[bytes, range]:
     if version != 2:
         raise SceneError(f"{path}: is GLB of version {version}; version 2 can be read. Export it again.")
     if length > start.size:
-        raise truncated(path, f"the GLB header declares {length} bytes of {start.size}")
+        raise scene_format.truncated(path, f"the GLB header declares {length} bytes of {start.size}")
     first = _HEADER.size + _CHUNK.size
     if kind != b"JSON" or json_bytes > start.size - first:
-        raise truncated(path, f"the GLB header declares {json_bytes} bytes of JSON")
+        raise scene_format.truncated(path, f"the GLB header declares {json_bytes} bytes of JSON")
     if json_bytes > _MAX_JSON_BYTES:
         raise SceneError(
             f"{path}: has {json_bytes} bytes of JSON; at most {_MAX_JSON_BYTES} can be read. Export the Gaussians "
             "without the other objects of the file."
         )
     offset = first + json_bytes + _CHUNK.size
-    text, chunk = read_bytes(path, first, first + json_bytes), read_bytes(path, first + json_bytes, offset)
+    text, chunk = (
+        scene_format.read_bytes(path, first, first + json_bytes),
+        scene_format.read_bytes(path, first + json_bytes, offset),
+    )
     size, kind = _CHUNK.unpack(chunk) if len(chunk) == _CHUNK.size else (0, b"BIN\0")
     if kind != b"BIN\0" or offset + size > max(start.size, offset):
-        raise truncated(path, f"the GLB declares {size} bytes of data after its JSON")
+        raise scene_format.truncated(path, f"the GLB declares {size} bytes of data after its JSON")
     return text, range(offset, offset + size)
 
 
@@ -235,14 +217,14 @@ def _part(
             )
     attributes = primitive["attributes"]
     refuse_changed_meaning(path, attributes)
-    count = whole_number("count", document["accessors"][attributes["POSITION"]]["count"], 1)
+    count = scene_format.whole_number("count", document["accessors"][attributes["POSITION"]]["count"], 1)
     try:
-        frame = Frame.of(Y_UP @ matrix)
+        frame = scene_format.Frame.of(scene_format.Y_UP @ matrix)
     except ValueError as error:
         raise SceneError(f"{path}: {error}, by the transformation of its node. Export it without that.") from error
-    tag = extras_tag(primitive.get("extras"), "the extras of the GLB")
+    tag = scene_format.extras_tag(primitive.get("extras"), "the extras of the GLB")
     present = sum(name in attributes for name in _HARMONICS)
-    coefficients = min(number for number in COEFFICIENTS.values() if number >= present)
+    coefficients = min(number for number in scene_format.COEFFICIENTS.values() if number >= present)
     return GlbPart(
         count,
         {name: _accessor(document, attributes, *each, count, data) for name, each in _ATTRIBUTES.items()},
@@ -265,14 +247,14 @@ def _accessor(
     view = document["bufferViews"][entry["bufferView"]]
     if view.get("buffer") != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
         raise ValueError(f"buffer view {entry['bufferView']} is not in the file, or compressed")
-    start = whole_number("byteOffset", view.get("byteOffset", 0))
-    size = whole_number("byteLength", view["byteLength"])
+    start = scene_format.whole_number("byteOffset", view.get("byteOffset", 0))
+    size = scene_format.whole_number("byteLength", view["byteLength"])
     if start + size > len(data):
         raise ValueError(f"buffer view {entry['bufferView']}: {view}, more than its {len(data)} bytes can hold")
     code = _TYPES[entry["componentType"]]
     kind = np.dtype((code, (_COMPONENTS[shape],)))
-    stride = whole_number("stride", view.get("byteStride", kind.itemsize))
-    first = whole_number("byteOffset", entry.get("byteOffset", 0))
+    stride = scene_format.whole_number("stride", view.get("byteStride", kind.itemsize))
+    first = scene_format.whole_number("byteOffset", entry.get("byteOffset", 0))
     if first + (count - 1) * stride + kind.itemsize > size or not kind.itemsize <= stride <= _MAX_STRIDE:
         raise ValueError(f"accessor of {name}: {count} values are more than its {size} bytes can hold")
     largest = _LARGEST.get(code) if entry.get("normalized", False) else None
@@ -295,8 +277,8 @@ def _node_matrix(
 def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     """Return a node's own transformation [4, 4]: a matrix in column order, or translation, rotation and scale."""
     if "matrix" in node:
-        return json_numbers(node["matrix"], 16).reshape(4, 4).T
-    quat = json_numbers(node.get("rotation", [0, 0, 0, 1]), 4)
+        return scene_format.json_numbers(node["matrix"], 16).reshape(4, 4).T
+    quat = scene_format.json_numbers(node.get("rotation", [0, 0, 0, 1]), 4)
     if not 0.5 < np.linalg.norm(quat) < 2:
         raise ValueError(f"rotation: {quat}")
     x, y, z, w = quat / np.linalg.norm(quat)
@@ -306,20 +288,20 @@ def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    matrix[:3, :3] *= json_numbers(node.get("scale", [1, 1, 1]), 3)
-    matrix[:3, 3] = json_numbers(node.get("translation", [0, 0, 0]), 3)
+    matrix[:3, :3] *= scene_format.json_numbers(node.get("scale", [1, 1, 1]), 3)
+    matrix[:3, 3] = scene_format.json_numbers(node.get("translation", [0, 0, 0]), 3)
     return matrix
 
 
 @np.errstate(over="ignore", invalid="ignore")  # invalid values are reported later
-def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+def _read(file: scene_format.OpenScene, header: scene_format.SceneHeader, into: scene_format.Arrays) -> None:
     """Fill the arrays of a scene. Opacities of 0 and 1 and standard deviations of 0 become infinite."""
     assert isinstance(header, GlbHeader)
     converters: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
         "means": np.asarray,
         "quats": lambda values: np.roll(values, 1, axis=1),
-        "scales": lambda values: logarithms(file.path, values),
-        "opacities": lambda values: logits(file.path, values)[:, 0],
+        "scales": lambda values: scene_format.logarithms(file.path, values),
+        "opacities": lambda values: scene_format.logits(file.path, values)[:, 0],
         "sh_dc": np.asarray,
     }
     first = 0
@@ -339,7 +321,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
 
 
 @np.errstate(invalid="ignore")
-def _convert_linear(arrays: Arrays) -> None:
+def _convert_linear(arrays: scene_format.Arrays) -> None:
     """Convert linear colors to sRGB in place (IEC 61966-2-1); harmonics by the slope at the color of degree 0."""
     colors = np.maximum(COLOR_OFFSET + SH_C0 * arrays["sh_dc"].astype(np.float64), 0)
     dark, power = colors <= 0.0031308, np.maximum(colors, 0.0031308) ** (1 / 2.4)
@@ -349,23 +331,27 @@ def _convert_linear(arrays: Arrays) -> None:
     arrays["sh_rest"] *= slopes[:, None].astype(np.float32)
 
 
-def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+def _values(
+    file: scene_format.OpenScene, accessor: Accessor, count: int
+) -> Iterator[tuple[slice, NDArray[np.float64]]]:
     """Yield the values of an accessor block by block, as slices of Gaussians and [n, components]."""
-    for block in blocks(count):
+    for block in scene_format.blocks(count):
         rows = block.stop - block.start
         data_bytes = (rows - 1) * accessor.stride + accessor.kind.itemsize
-        data = read_rows(file, np.dtype(np.uint8), accessor.offset + block.start * accessor.stride, data_bytes)
+        data = scene_format.read_rows(
+            file, np.dtype(np.uint8), accessor.offset + block.start * accessor.stride, data_bytes
+        )
         values = np.ndarray((rows,), accessor.kind, data, 0, (accessor.stride,)).astype(np.float64)
         yield block, values if accessor.largest is None else np.maximum(values / accessor.largest, -1)
 
 
-def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
+def _write(output: BinaryIO, arrays: scene_format.Arrays, rendering: Rendering) -> None:
     """Write a GLB with float32 attributes, and colors for programs that show only points."""
     arrays = {name: array.copy() for name, array in arrays.items()}
-    Frame.of(Y_UP).apply(arrays)
+    scene_format.Frame.of(scene_format.Y_UP).apply(arrays)
     columns = _columns(arrays)
     data_bytes = sum(column.nbytes for _, column in columns)
-    text = json.dumps(_document(columns, data_bytes, extras_of(rendering))).encode()
+    text = json.dumps(_document(columns, data_bytes, scene_format.extras_of(rendering))).encode()
     text += b" " * (-len(text) % 4)
     length = _HEADER.size + 2 * _CHUNK.size + len(text) + data_bytes
     if length > _MAX_BYTES:
@@ -377,7 +363,7 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
 
 
 @np.errstate(over="ignore")
-def _columns(arrays: Arrays) -> list[tuple[str, NDArray[Any]]]:
+def _columns(arrays: scene_format.Arrays) -> list[tuple[str, NDArray[Any]]]:
     """Return the attributes of a scene in glTF's axes and their values, [n, components]."""
     opacities = np.clip(1 / (1 + np.exp(-arrays["opacities"].astype(np.float64))), 1e-37, _LARGEST_OPACITY)
     quats = np.roll(arrays["quats"].astype(np.float64), -1, axis=1)
@@ -430,11 +416,11 @@ def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int, extras: 
     }
 
 
-def _matches(start: FileStart) -> bool:
+def _matches(start: scene_format.FileStart) -> bool:
     return start.head.startswith(_MAGIC)
 
 
-GLB = SceneFormat(
+GLB = scene_format.SceneFormat(
     *("glb", "GLB", 240, _matches, _read_header, _read, _write),
     media_type="model/gltf-binary",
     ranges={"scales": _LOG_SCALES},

@@ -32,28 +32,7 @@ from numpy.typing import NDArray
 from sgsst_core.constants import COLOR_OFFSET, EPS2D, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.advice import refuse_changed_meaning
-from sgsst_core.files.formats.scene_format import (
-    COEFFICIENTS,
-    OPACITY_LOGITS,
-    STORED_COEFFICIENTS,
-    Arrays,
-    FileStart,
-    OpenScene,
-    RenderTag,
-    SceneFormat,
-    SceneHeader,
-    along_curve,
-    blocks,
-    join_bits,
-    opacity_bytes,
-    read_bytes,
-    read_rows,
-    stated,
-    truncated,
-    usable_eps2d,
-    with_largest,
-    without_largest,
-)
+from sgsst_core.files.formats import scene_format
 from sgsst_core.scene.rendering import Rendering
 
 #: Properties of the scene's tensors; opacity and f_rest_* follow.
@@ -68,7 +47,7 @@ RGB = ("red", "green", "blue")
 
 
 @dataclass(frozen=True)
-class PlySceneHeader(SceneHeader):
+class PlySceneHeader(scene_format.SceneHeader):
     """Header of a PLY.
 
     Attributes:
@@ -81,11 +60,11 @@ class PlySceneHeader(SceneHeader):
     sources: dict[str, str]
 
 
-def _read_header(start: FileStart) -> PlySceneHeader:
+def _read_header(start: scene_format.FileStart) -> PlySceneHeader:
     header = read_header(start)
     stored, sources = _check_properties(start.path, header)
     check_length(start.path, header)
-    coefficients = min(stored, COEFFICIENTS[3])
+    coefficients = min(stored, scene_format.COEFFICIENTS[3])
     notes = ["SH bands above degree 3 are not drawn; only a stylized PLY keeps them"] if coefficients < stored else []
     if sources:
         notes.append(f"{', '.join(dict.fromkeys(sources.values()))} become the usual properties of a stylized PLY")
@@ -124,7 +103,7 @@ def _check_properties(path: Path, header: "PlyHeader") -> tuple[int, dict[str, s
     if vertex.count == 0:
         raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
     rest = [name for name in kinds if re.fullmatch(r"f_rest_\d+", name)]
-    if len(rest) // 3 not in STORED_COEFFICIENTS.values() or len(rest) % 3:
+    if len(rest) // 3 not in scene_format.STORED_COEFFICIENTS.values() or len(rest) % 3:
         raise SceneError(
             f"{path}: has {len(rest)} f_rest properties; SH degree 0 to 4 have 0, 9, 24, 45, 72. Export it again."
         )
@@ -143,7 +122,7 @@ def _check_properties(path: Path, header: "PlyHeader") -> tuple[int, dict[str, s
     return len(rest) // 3, sources
 
 
-def write_ply(output: BinaryIO, arrays: Arrays, rendering: Rendering, least_coefficients: int = 0) -> None:
+def write_ply(output: BinaryIO, arrays: scene_format.Arrays, rendering: Rendering, least_coefficients: int = 0) -> None:
     """Write a binary little-endian float32 PLY with the usual order of properties. Normals are 0.
 
     Args:
@@ -161,7 +140,7 @@ def write_ply(output: BinaryIO, arrays: Arrays, rendering: Rendering, least_coef
         *("end_header", ""),
     ]
     output.write("\n".join(lines).encode())
-    for part in blocks(count):
+    for part in scene_format.blocks(count):
         block = {name: array[part] for name, array in arrays.items()}
         means, opacities = block["means"], block["opacities"][:, None]
         rest = np.zeros((len(means), 3, coefficients), np.float32)  # channel-major
@@ -171,11 +150,11 @@ def write_ply(output: BinaryIO, arrays: Arrays, rendering: Rendering, least_coef
         output.write(np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4").data)
 
 
-def _matches(start: FileStart) -> bool:
+def _matches(start: scene_format.FileStart) -> bool:
     return start.head.startswith(b"ply") and not COMPRESSED_PLY.matches(start)
 
 
-PLY = SceneFormat("ply", "PLY", 248, _matches, _read_header, write=write_ply)
+PLY = scene_format.SceneFormat("ply", "PLY", 248, _matches, _read_header, write=write_ply)
 
 #: Maximum size of a header. A 3DGS header takes 2 kB; a megabyte allows long comments. The limit avoids searching a
 #: whole file that is not a PLY for `end_header`.
@@ -275,13 +254,13 @@ def comment_of(line: bytes) -> str | None:
     return comment.decode("latin-1").strip() if keyword in (b"comment", b"obj_info") else None
 
 
-def read_header(file: FileStart) -> PlyHeader:
+def read_header(file: scene_format.FileStart) -> PlyHeader:
     """Parse the header of a PLY file without reading its data.
 
     Raises:
         SceneError: If the file cannot be read, has no PLY header, or its header has an invalid line.
     """
-    path, start = file.path, read_bytes(file.path, 0, MAX_HEADER_BYTES)
+    path, start = file.path, scene_format.read_bytes(file.path, 0, MAX_HEADER_BYTES)
     opening = re.match(rb"ply(\r\n|\n|\r)", start)
     if not opening:
         raise SceneError(f"{path}: has no PLY header (it does not start with 'ply'). Give a 3DGS scene as .ply file.")
@@ -351,7 +330,7 @@ def check_length(path: Path, header: PlyHeader) -> None:
     if least - (1 if header.text else 0) > data:  # the last line may lack its line end
         declared = ", ".join(f"{element.count} {name}" for name, element in header.elements.items())
         needed = f"which takes at least {least} bytes, but only {data} follow it"
-        raise truncated(path, f"the header declares {declared}, {needed}")
+        raise scene_format.truncated(path, f"the header declares {declared}, {needed}")
 
 
 def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
@@ -378,14 +357,14 @@ def surplus(path: Path, header: PlyHeader) -> tuple[str, ...]:
         return ()
     last = [*header.elements.values()][-1]
     end = element_offsets(path, header)[last.name] + last.count * last.dtype.itemsize
-    data = read_bytes(path, end, end + _MAX_PADDING + 1)
+    data = scene_format.read_bytes(path, end, end + _MAX_PADDING + 1)
     if len(data) <= _MAX_PADDING and not data.strip(_PADDING):
         return ()
     more = path.stat().st_size - end
     return (f"the file is longer than its header declares by {more} B, which are not read; copy or export it again",)
 
 
-def ply_tag(header: PlyHeader) -> RenderTag:
+def ply_tag(header: PlyHeader) -> scene_format.RenderTag:
     """Return the render mode that the comments and properties of a PLY state; the last comment counts."""
     names = header.vertex.kinds
     mode, eps2d, reasons = None, None, []
@@ -393,7 +372,7 @@ def ply_tag(header: PlyHeader) -> RenderTag:
         if (match := _MODE.fullmatch(comment)) and match[1].lower() in _MODES:
             mode = _MODES[match[1].lower()]
             reasons.append(f"the comment {comment!r}")
-        elif (match := _EPS2D.fullmatch(comment)) and (blur := usable_eps2d(match[1])):
+        elif (match := _EPS2D.fullmatch(comment)) and (blur := scene_format.usable_eps2d(match[1])):
             eps2d = blur
             reasons.append(f"the comment {comment!r}")
     if mode is None and FILTER_3D in names:
@@ -405,7 +384,7 @@ def ply_tag(header: PlyHeader) -> RenderTag:
     usual = _MIP_EPS2D if FILTER_3D in names or "Exported from Brush" in header.comments else EPS2D
     if eps2d is None:
         eps2d = usual if mode == "antialiased" else EPS2D
-    return stated(mode or "classic", ", ".join(reasons), eps2d)
+    return scene_format.stated(mode or "classic", ", ".join(reasons), eps2d)
 
 
 def is_flat(names: Collection[str]) -> bool:
@@ -463,17 +442,17 @@ _HARMONICS = (8 * (np.array([0, *(np.arange(1, 255) + 0.5) / 256, 1]) - 0.5)).as
 
 
 @dataclass(frozen=True)
-class CompressedPlyHeader(SceneHeader):
+class CompressedPlyHeader(scene_format.SceneHeader):
     """Header of a compressed PLY."""
 
     ply: PlyHeader
 
 
-def _matches_compressed(start: FileStart) -> bool:
+def _matches_compressed(start: scene_format.FileStart) -> bool:
     return start.head.startswith(b"ply") and re.search(rb"[\r\n]property \w+ packed_position\s", start.head) is not None
 
 
-def _read_compressed_header(start: FileStart) -> CompressedPlyHeader:
+def _read_compressed_header(start: scene_format.FileStart) -> CompressedPlyHeader:
     path = start.path
     header = read_header(start)
     for name in ("vertex", "chunk"):
@@ -514,7 +493,9 @@ def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, .
         )
 
 
-def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
+def _read(
+    file: scene_format.OpenScene, header: scene_format.SceneHeader, into: scene_format.Arrays
+) -> scene_format.SceneHeader:
     """Fill the arrays of a scene, and return the header with the note on bytes after the last element."""
     assert isinstance(header, CompressedPlyHeader)
     notes = surplus(file.path, header.ply)
@@ -522,9 +503,9 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
     kinds = {name: element.dtype for name, element in header.ply.elements.items()}
 
     def rows(name: str, first: int, count: int) -> NDArray[Any]:
-        return read_rows(file, kinds[name], starts[name] + first * kinds[name].itemsize, count)
+        return scene_format.read_rows(file, kinds[name], starts[name] + first * kinds[name].itemsize, count)
 
-    for block in blocks(header.count):
+    for block in scene_format.blocks(header.count):
         start, count = block.start, block.stop - block.start
         chunks = rows("chunk", start // CHUNK_ROWS, -(-count // CHUNK_ROWS))
         _unpack(rows("vertex", start, count), chunks, {name: array[block] for name, array in into.items()})
@@ -537,7 +518,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # non-finite results are reported later
-def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
+def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: scene_format.Arrays) -> None:
     position, rotation, scale, color = (rows[name].astype(np.uint32) for name in _PACKED)
     chunk = np.arange(len(rows)) // CHUNK_ROWS
 
@@ -554,9 +535,9 @@ def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
     fraction = np.stack([(color >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
     colors = between("", "rgb", fraction) if "min_r" in (chunks.dtype.names or ()) else fraction
     into["sh_dc"][:] = (colors - COLOR_OFFSET) / SH_C0
-    into["opacities"][:] = OPACITY_LOGITS[color & 255]
+    into["opacities"][:] = scene_format.OPACITY_LOGITS[color & 255]
     components = np.stack([(rotation >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023
-    into["quats"][:] = with_largest(rotation >> 30, (components - 0.5) * np.sqrt(2))
+    into["quats"][:] = scene_format.with_largest(rotation >> 30, (components - 0.5) * np.sqrt(2))
 
 
 def _three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
@@ -564,15 +545,15 @@ def _three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
     return np.stack([(packed >> 21) / 2047, ((packed >> 11) & 1023) / 1023, (packed & 2047) / 2047], axis=1)
 
 
-def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
+def _write(output: BinaryIO, arrays: scene_format.Arrays, rendering: Rendering) -> None:
     """Write a compressed PLY.
 
     Gaussians are sorted along a space-filling curve, so that chunks are compact and their bounds are tight.
     """
     count, coefficients = arrays["sh_rest"].shape[:2]
-    order = along_curve(arrays["means"])
+    order = scene_format.along_curve(arrays["means"])
     output.write(_header(count, coefficients, rendering))
-    parts = [order[block] for block in blocks(count)]
+    parts = [order[block] for block in scene_format.blocks(count)]
     packed = []
     for rows in parts:
         bounds_of, values = _pack({name: array[rows] for name, array in arrays.items() if name != "sh_rest"})
@@ -599,7 +580,7 @@ def _header(count: int, coefficients: int, rendering: Rendering) -> bytes:
     return "\n".join(lines).encode()
 
 
-def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+def _pack(arrays: scene_format.Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """Return the bounds [chunks, 18] and compressed values [n, 4] of Gaussians that start at a chunk boundary."""
     starts = np.arange(0, len(arrays["means"]), CHUNK_ROWS)
     chunk = np.arange(len(arrays["means"])) // CHUNK_ROWS
@@ -614,19 +595,21 @@ def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         bounds_of += [low, high]
         extent = high.astype(np.float64) - low
         fractions.append((values.astype(np.float64) - low[chunk]) / np.where(extent > 0, extent, 1)[chunk])
-    largest, three = without_largest(arrays["quats"])
+    largest, three = scene_format.without_largest(arrays["quats"])
     packed = [
-        join_bits(fractions[0], _THREE_BITS),
-        join_bits(np.column_stack([largest / 3, three / np.sqrt(2) + 0.5]), (2, 10, 10, 10)),
-        join_bits(fractions[1], _THREE_BITS),
-        join_bits(np.column_stack([fractions[2], opacity_bytes(arrays["opacities"]) / 255]), (8, 8, 8, 8)),
+        scene_format.join_bits(fractions[0], _THREE_BITS),
+        scene_format.join_bits(np.column_stack([largest / 3, three / np.sqrt(2) + 0.5]), (2, 10, 10, 10)),
+        scene_format.join_bits(fractions[1], _THREE_BITS),
+        scene_format.join_bits(
+            np.column_stack([fractions[2], scene_format.opacity_bytes(arrays["opacities"]) / 255]), (8, 8, 8, 8)
+        ),
     ]
     return np.concatenate(bounds_of, axis=1), np.stack(packed, axis=1)
 
 
 def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the largest distance between positions that can be stored in the chunk of each Gaussian, [n]."""
-    order = along_curve(means)
+    order = scene_format.along_curve(means)
     starts = np.arange(0, len(means), CHUNK_ROWS)
     ends = (side.reduceat(means[order].astype(np.float64), starts) for side in (np.maximum, np.minimum))
     steps = np.empty(len(means))
@@ -634,7 +617,7 @@ def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
     return steps
 
 
-COMPRESSED_PLY = SceneFormat(
+COMPRESSED_PLY = scene_format.SceneFormat(
     *("compressed.ply", "compressed PLY", 61, _matches_compressed, _read_compressed_header, _read, _write),
     ranges={"scales": (-_LARGEST_SCALE, _LARGEST_SCALE), "sh_rest": (-4.0, 4.0)},
     step=_step,

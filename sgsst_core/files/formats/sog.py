@@ -38,27 +38,7 @@ from PIL import Image
 from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError, reading_scene
 from sgsst_core.files.advice import SCENES, converted, known_kind, refuse_changed_meaning
-from sgsst_core.files.formats.scene_format import (
-    COEFFICIENTS,
-    OPACITY_LOGITS,
-    WRONG_JSON,
-    Arrays,
-    FileStart,
-    OpenScene,
-    SceneFormat,
-    SceneHeader,
-    along_curve,
-    blocks,
-    extras_of,
-    extras_tag,
-    json_numbers,
-    opacity_bytes,
-    read_bytes,
-    to_steps,
-    whole_number,
-    with_largest,
-    without_largest,
-)
+from sgsst_core.files.formats import scene_format
 from sgsst_core.scene.rendering import Rendering
 
 ZIP_MAGIC = b"PK\x03\x04"
@@ -269,8 +249,8 @@ _PALETTE_COLUMNS = 64
 _MAX_PALETTE = 1 << 16
 #: Number of vectors below which a palette is not worth its loss.
 _MIN_PALETTE = 1 << 14
-_PALETTE_PIXELS = _MAX_PALETTE * COEFFICIENTS[3]
-_COEFFICIENTS_BY_WIDTH = {_PALETTE_COLUMNS * number: number for number in COEFFICIENTS.values() if number}
+_PALETTE_PIXELS = _MAX_PALETTE * scene_format.COEFFICIENTS[3]
+_COEFFICIENTS_BY_WIDTH = {_PALETTE_COLUMNS * number: number for number in scene_format.COEFFICIENTS.values() if number}
 #: Alpha of the rotations' image for w as the omitted component; x, y and z follow.
 _FIRST_TAG = 252
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -285,7 +265,7 @@ _EFFORT = 50
 
 
 @dataclass(frozen=True)
-class SogHeader(SceneHeader):
+class SogHeader(scene_format.SceneHeader):
     """Header of a SOG scene.
 
     Attributes:
@@ -410,7 +390,7 @@ class SogFiles:
             ) from error
 
 
-def _matches(start: FileStart) -> bool:
+def _matches(start: scene_format.FileStart) -> bool:
     head = start.head
     archive = head.startswith(ZIP_MAGIC) and known_kind(start.path, head, SCENES) is None
     return archive or (head.lstrip().startswith(b"{") and b'"means"' in head)
@@ -419,7 +399,7 @@ def _matches(start: FileStart) -> bool:
 @contextmanager
 def _opened(path: Path) -> Iterator[SogFiles]:
     """Yield the files of a scene, given an archive, or a file in a folder."""
-    if read_bytes(path, 0, 4) != ZIP_MAGIC:
+    if scene_format.read_bytes(path, 0, 4) != ZIP_MAGIC:
         yield SogFiles(path)
         return
     archive_list(path)
@@ -431,7 +411,7 @@ def _opened(path: Path) -> Iterator[SogFiles]:
         yield SogFiles(path, archive)
 
 
-def _read_header(start: FileStart) -> SogHeader:
+def _read_header(start: scene_format.FileStart) -> SogHeader:
     with _opened(start.path) as files:
         return sog_header(files)
 
@@ -441,7 +421,7 @@ def sog_header(files: SogFiles) -> SogHeader:
     text, where = files.meta(), f"{files.path}: {files.folder}{META_NAME}"
     try:
         header = _parsed(files, json.loads(text))
-    except WRONG_JSON as error:
+    except scene_format.WRONG_JSON as error:
         raise SceneError(
             f"{where} is not that of a SOG scene ({repr(error)[:200]}). Export the scene again."
         ) from error
@@ -472,11 +452,11 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
     for name, own in names.items():
         if type(own) is not list or len(own) != _IMAGES[name] or not all(_NAME.fullmatch(each) for each in own):
             raise ValueError(f"files of {name}: {own}")
-    count = whole_number("count", meta["count"] if version == 2 else meta["means"]["shape"][0], 1)
-    bounds = np.stack([json_numbers(meta["means"][side], 3) for side in ("mins", "maxs")])
+    count = scene_format.whole_number("count", meta["count"] if version == 2 else meta["means"]["shape"][0], 1)
+    bounds = np.stack([scene_format.json_numbers(meta["means"][side], 3) for side in ("mins", "maxs")])
     table = _codebook if version == 2 else _steps
     scales, colors = table(meta["scales"], 3), table(meta["sh0"], 4)
-    opacities = OPACITY_LOGITS if version == 2 else colors[3]
+    opacities = scene_format.OPACITY_LOGITS if version == 2 else colors[3]
     coefficients, harmonics, vectors = 0, None, None
     if "shN" in names:
         width, _ = files.dimensions(names["shN"][0], 1, _PALETTE_PIXELS)
@@ -484,10 +464,10 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
             raise ValueError(f"width of {names['shN'][0]}: {width}")
         coefficients, harmonics = _COEFFICIENTS_BY_WIDTH[width], table(meta["shN"], 1)[0]
         if meta["shN"].get("count") is not None:
-            vectors = whole_number("count of shN", meta["shN"]["count"], 1)
+            vectors = scene_format.whole_number("count of shN", meta["shN"]["count"], 1)
     extras = meta["extras"] if isinstance(meta.get("extras"), dict) else {}
     model = meta.get("model", "antialiased" if meta.get("antialias") is True else "default")
-    tag = extras_tag({**extras, "model": model}, "meta.json")
+    tag = scene_format.extras_tag({**extras, "model": model}, "meta.json")
     return SogHeader(
         *(SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics, vectors),
         tag=tag,
@@ -503,7 +483,7 @@ def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
     codebook = entry["codebook"]
     if not 0 < len(codebook) <= VALUES:
         raise ValueError(f"codebook of {len(codebook)} values")
-    numbers = json_numbers(codebook, len(codebook))
+    numbers = scene_format.json_numbers(codebook, len(codebook))
     if len(numbers) > 1 and codebook[0] is None:
         numbers[0] = numbers[1] + (numbers[1] - numbers[-1]) / (VALUES - 1)
     values = np.pad(numbers, (0, VALUES - len(numbers)), constant_values=np.nan)
@@ -513,27 +493,27 @@ def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
 @np.errstate(over="ignore", invalid="ignore")  # non-finite results are reported later
 def _steps(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
     """Return the values of each byte in version 1 by channel, [channels, 256]."""
-    low, high = (json_numbers(entry[side], channels)[:, None] for side in ("mins", "maxs"))
+    low, high = (scene_format.json_numbers(entry[side], channels)[:, None] for side in ("mins", "maxs"))
     return low + (high - low) * (np.arange(VALUES) / 255)
 
 
-def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+def _read(file: scene_format.OpenScene, header: scene_format.SceneHeader, into: scene_format.Arrays) -> None:
     assert isinstance(header, SogHeader)
     with _opened(file.path) as files:
         read_sog(files, header, into)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # non-finite results are reported later
-def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> None:
+def read_sog(files: SogFiles, header: SogHeader, into: scene_format.Arrays) -> None:
     """Fill the arrays of a scene."""
     where = f"{files.path}: {files.folder}"
     read_positions(files, header, into["means"])
     quats = _pixels(files, header, "quats")
-    for block in blocks(header.count):
+    for block in scene_format.blocks(header.count):
         index = quats[block, 3].astype(np.int64) - _FIRST_TAG
         if index.min() < 0:
             raise SceneError(f"{where}{header.names['quats'][0]} has no valid rotations. Export the scene again.")
-        into["quats"][block] = with_largest(index, (quats[block, :3] / 255 - 0.5) * np.sqrt(2))
+        into["quats"][block] = scene_format.with_largest(index, (quats[block, :3] / 255 - 0.5) * np.sqrt(2))
     colors = _pixels(files, header, "sh0")
     into["scales"][:] = _looked_up(header.scales, _pixels(files, header, "scales"))
     into["sh_dc"][:] = _looked_up(header.colors, colors)
@@ -559,7 +539,7 @@ def _pixels(files: SogFiles, header: SogHeader, name: str, index: int = 0) -> ND
 def read_positions(files: SogFiles, header: SogHeader, into: NDArray[np.float32]) -> None:
     """Fill an array [n, 3] with the positions of a scene."""
     low, high = (_pixels(files, header, "means", index) for index in (0, 1))
-    for block in blocks(header.count):
+    for block in scene_format.blocks(header.count):
         steps = (low[block, :3] | high[block, :3].astype(np.uint16) << 8) / 65535
         values = header.bounds[0] + (header.bounds[1] - header.bounds[0]) * steps
         into[block] = np.sign(values) * np.expm1(np.abs(values))
@@ -601,26 +581,26 @@ def recolored(files: SogFiles, header: SogHeader, change: NDArray[np.float32]) -
     return stored | {name: _webp(pixels, image.shape[1]), META_NAME: json.dumps(meta).encode()}
 
 
-def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
+def _write(output: BinaryIO, arrays: scene_format.Arrays, rendering: Rendering) -> None:
     """Write a SOG archive. Gaussians are sorted along a space-filling curve, which compresses better."""
     count, coefficients = arrays["sh_rest"].shape[:2]
     if count > _MAX_SIDE**2:
         raise OutputError(f"SOG cannot hold {count} Gaussians. Write a PLY, or a .compressed.ply.")
     steps, bounds = _encoded_positions(arrays["means"])
     # the order of what is written, so that a scene from a SOG file stays in order
-    order = along_curve(steps.astype(np.float32))
+    order = scene_format.along_curve(steps.astype(np.float32))
     sorted_arrays = {name: array[order] for name, array in arrays.items()}
     images = {
         "means_l.webp": (steps[order] & 255).astype(np.uint8),
         "means_u.webp": (steps[order] >> 8).astype(np.uint8),
     }
-    largest, three = without_largest(sorted_arrays["quats"])
-    quats = to_steps(three / np.sqrt(2) + 0.5, 255).astype(np.uint8)
+    largest, three = scene_format.without_largest(sorted_arrays["quats"])
+    quats = scene_format.to_steps(three / np.sqrt(2) + 0.5, 255).astype(np.uint8)
     images["quats.webp"] = np.column_stack([quats, (_FIRST_TAG + largest).astype(np.uint8)])
     scales, colors = value_codebook(arrays["scales"]), value_codebook(arrays["sh_dc"])
     images["scales.webp"] = nearest_entries(sorted_arrays["scales"], scales)
     images["sh0.webp"] = np.column_stack(
-        [nearest_entries(sorted_arrays["sh_dc"], colors), opacity_bytes(sorted_arrays["opacities"])]
+        [nearest_entries(sorted_arrays["sh_dc"], colors), scene_format.opacity_bytes(sorted_arrays["opacities"])]
     )
     meta: dict[str, Any] = {
         "version": 2,
@@ -630,7 +610,7 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
     }
-    extras = extras_of(rendering)
+    extras = scene_format.extras_of(rendering)
     meta |= {"model": extras.pop("model")} if "model" in extras else {}
     meta |= {"extras": extras} if extras else {}
     if coefficients:
@@ -659,7 +639,7 @@ def _encoded_positions(means: NDArray[np.float32]) -> tuple[NDArray[np.uint32], 
     """Return positions as 16-bit steps, [n, 3], and their bounds on the logarithmic scale, [2, 3]."""
     values = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = values.min(axis=0), values.max(axis=0)
-    return to_steps((values - low) / np.where(high > low, high - low, 1), 65535), np.stack([low, high])
+    return scene_format.to_steps((values - low) / np.where(high > low, high - low, 1), 65535), np.stack([low, high])
 
 
 def _webp(pixels: NDArray[np.uint8], width: int) -> bytes:
@@ -673,7 +653,7 @@ def _webp(pixels: NDArray[np.uint8], width: int) -> bytes:
     return file.getvalue()
 
 
-SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write)
+SOG = scene_format.SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write)
 
 
 #: Name of the index in a folder or an archive.
@@ -686,7 +666,7 @@ _PART = re.compile(rf"((?:[\w-][\w.-]{{0,99}}/){{1,4}}){re.escape(META_NAME)}")
 
 
 @dataclass(frozen=True)
-class StreamedHeader(SceneHeader):
+class StreamedHeader(scene_format.SceneHeader):
     """Header of a streamed SOG.
 
     Attributes:
@@ -710,7 +690,7 @@ def _opened_levels(path: Path) -> Iterator[tuple[SogFiles, bytes]]:
         yield files, files.load(name, _MAX_INDEX_BYTES)
 
 
-def _matches_streamed(start: FileStart) -> bool:
+def _matches_streamed(start: scene_format.FileStart) -> bool:
     if not start.head.startswith(ZIP_MAGIC):
         return start.head.lstrip().startswith(b"{") and b'"lodLevels"' in start.head
     if known_kind(start.path, start.head, SCENES):
@@ -721,11 +701,11 @@ def _matches_streamed(start: FileStart) -> bool:
         return False
 
 
-def _read_streamed_header(start: FileStart) -> StreamedHeader:
+def _read_streamed_header(start: scene_format.FileStart) -> StreamedHeader:
     with _opened_levels(start.path) as (files, text):
         try:
             folders = _levels(json.loads(text))
-        except WRONG_JSON as error:
+        except scene_format.WRONG_JSON as error:
             raise SceneError(
                 f"{start.path}: {INDEX_NAME} is not that of a streamed SOG ({repr(error)[:200]}). Export the scene "
                 "again."
@@ -804,7 +784,9 @@ def _part(files: SogFiles, folder: str, level: int | None, ranges: list[tuple[in
     return header
 
 
-def _read_streamed(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
+def _read_streamed(
+    file: scene_format.OpenScene, header: scene_format.SceneHeader, into: scene_format.Arrays
+) -> scene_format.SceneHeader:
     assert isinstance(header, StreamedHeader)
     with _opened_levels(file.path) as (files, _):
         for folder, rows in header.rows.items():
@@ -823,7 +805,7 @@ def pack(index: Path, target: Path) -> None:
     Raises:
         SceneError: If it is no streamed SOG, or a file is missing.
     """
-    header = _read_streamed_header(FileStart(index, b"", index.stat().st_size))
+    header = _read_streamed_header(scene_format.FileStart(index, b"", index.stat().st_size))
     with _opened_levels(index) as (files, text), zipfile.ZipFile(target, "w") as archive:
         for folder, part in header.parts.items():
             unchanged = np.zeros((part.count, 3), np.float32)
@@ -856,7 +838,7 @@ def write_recolored(
     from scipy.spatial import cKDTree
 
     with _opened_levels(original) as (files, text):
-        own: Arrays = {name: np.empty((header.count, 3), np.float32) for name in ("means", "sh_dc")}
+        own: scene_format.Arrays = {name: np.empty((header.count, 3), np.float32) for name in ("means", "sh_dc")}
         for folder, rows in header.rows.items():
             part = header.parts[folder]
             read_positions(files.part(folder), part, own["means"][rows])
@@ -879,6 +861,6 @@ def write_recolored(
         archive.writestr(zipfile.ZipInfo(INDEX_NAME), text)
 
 
-STREAMED_SOG = SceneFormat(
+STREAMED_SOG = scene_format.SceneFormat(
     "zip", "streamed SOG", 14, _matches_streamed, _read_streamed_header, _read_streamed, media_type="application/zip"
 )

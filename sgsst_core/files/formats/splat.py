@@ -20,25 +20,12 @@ from numpy.typing import NDArray
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
-from sgsst_core.files.formats.scene_format import (
-    COEFFICIENTS,
-    OPACITY_LOGITS,
-    Arrays,
-    FileStart,
-    OpenScene,
-    SceneFormat,
-    SceneHeader,
-    logarithms,
-    read_bytes,
-    read_rows,
-    row_blocks,
-    truncated,
-)
+from sgsst_core.files.formats import scene_format
 
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 
 
-def _matches(start: FileStart) -> bool:
+def _matches(start: scene_format.FileStart) -> bool:
     """Return whether the data looks like .splat records. The format has no header.
 
     Nearly all records must have finite positions, plausible sizes, and rotations of length 1.
@@ -52,27 +39,27 @@ def _matches(start: FileStart) -> bool:
     return bool(fits.mean() > 0.9)
 
 
-def _read_header(start: FileStart) -> SceneHeader:
+def _read_header(start: scene_format.FileStart) -> scene_format.SceneHeader:
     count, rest = divmod(start.size, ROW.itemsize)
     if rest:
         raise SceneError(
             f"{start.path}: is a .splat file of {count} Gaussians of {ROW.itemsize} bytes and {rest} bytes more: it "
             "is truncated. Copy or export it again."
         )
-    return SceneHeader(SPLAT, count, 0)
+    return scene_format.SceneHeader(SPLAT, count, 0)
 
 
-def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+def _read(file: scene_format.OpenScene, header: scene_format.SceneHeader, into: scene_format.Arrays) -> None:
     """Fill the arrays of a scene. A standard deviation of 0 becomes a log scale of minus infinity."""
-    for block, rows in row_blocks(file, ROW, 0, header.count):
+    for block, rows in scene_format.row_blocks(file, ROW, 0, header.count):
         into["means"][block] = rows["position"]
-        into["scales"][block] = logarithms(file.path, rows["scale"].astype(np.float64))
+        into["scales"][block] = scene_format.logarithms(file.path, rows["scale"].astype(np.float64))
         into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
-        into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
+        into["opacities"][block] = scene_format.OPACITY_LOGITS[rows["color"][:, 3]]
         into["quats"][block] = (rows["rotation"].astype(np.float64) - 128) / 128
 
 
-SPLAT = SceneFormat("splat", ".splat", 32, _matches, _read_header, _read)
+SPLAT = scene_format.SceneFormat("splat", ".splat", 32, _matches, _read_header, _read)
 
 #: Version 0.1, the only one.
 _MAGIC = b"\0\1\0\0"
@@ -106,7 +93,7 @@ _SECTION = np.dtype(
 
 
 @dataclass(frozen=True)
-class KsplatHeader(SceneHeader):
+class KsplatHeader(scene_format.SceneHeader):
     """Header of a .ksplat file.
 
     Attributes:
@@ -122,7 +109,7 @@ class KsplatHeader(SceneHeader):
     sections: list[dict[str, Any]]
 
 
-def _matches_ksplat(start: FileStart) -> bool:
+def _matches_ksplat(start: scene_format.FileStart) -> bool:
     """Return whether the data looks like a .ksplat header. The format has no magic number beyond its version."""
     head = start.head
     if not head.startswith(_MAGIC) or len(head) < _HEADER_BYTES:
@@ -132,15 +119,15 @@ def _matches_ksplat(start: FileStart) -> bool:
     return sections > 0 and filled <= sections and count > 0 and level in _TYPES and all(map(math.isfinite, center))
 
 
-def _read_ksplat_header(start: FileStart) -> KsplatHeader:
+def _read_ksplat_header(start: scene_format.FileStart) -> KsplatHeader:
     path, head = start.path, start.head
     sections, _, _, count, level = struct.unpack_from("<IIIIH", head, 4)
     low, high = struct.unpack_from("<2f", head, 36)
     table_end = _HEADER_BYTES + _SECTION.itemsize * sections
     if sections > _MAX_SECTIONS or table_end > start.size:
         declared = f"the .ksplat header declares {sections} sections in {start.size} bytes"
-        raise truncated(path, f"{declared}; at most {_MAX_SECTIONS} can be read")
-    table = np.frombuffer(read_bytes(path, _HEADER_BYTES, table_end), _SECTION)
+        raise scene_format.truncated(path, f"{declared}; at most {_MAX_SECTIONS} can be read")
+    table = np.frombuffer(scene_format.read_bytes(path, _HEADER_BYTES, table_end), _SECTION)
     read, position = [], table_end
     for index, entry in enumerate(table.tolist()):
         section: dict[str, Any] = dict(zip(_SECTION.names or (), entry, strict=True)) | {"start": position}
@@ -152,14 +139,16 @@ def _read_ksplat_header(start: FileStart) -> KsplatHeader:
             section["data"] = position + 4 * section["partial"] + section["center_bytes"] * section["buckets"]
             position = section["data"] + _row(level, degree).itemsize * section["most"]
         if not fits or position > start.size:
-            raise truncated(path, f"section {index} of the .ksplat file is wrong, or ends after its {start.size} bytes")
+            raise scene_format.truncated(
+                path, f"section {index} of the .ksplat file is wrong, or ends after its {start.size} bytes"
+            )
         read.append(section)
     if sum(section["count"] for section in read) != count:
         raise SceneError(
             f"{path}: the .ksplat header declares {count} Gaussians, but its sections hold "
             f"{sum(section['count'] for section in read)}: it was not written completely. Export it again."
         )
-    coefficients = COEFFICIENTS[max(section["degree"] for section in read)]
+    coefficients = scene_format.COEFFICIENTS[max(section["degree"] for section in read)]
     return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read)
 
 
@@ -167,11 +156,11 @@ def _row(level: int, degree: int) -> np.dtype:
     """Return the dtype of a Gaussian."""
     position, value, harmonic = _TYPES[level]
     fields = [("position", position, 3), ("scale", value, 3), ("rotation", value, 4), ("color", "u1", 4)]
-    return np.dtype([*fields, ("harmonics", harmonic, 3 * COEFFICIENTS[degree])])
+    return np.dtype([*fields, ("harmonics", harmonic, 3 * scene_format.COEFFICIENTS[degree])])
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # invalid values are reported later
-def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+def _read_ksplat(file: scene_format.OpenScene, header: scene_format.SceneHeader, into: scene_format.Arrays) -> None:
     """Fill the arrays of a scene. A standard deviation of 0 at level 0 becomes a log scale of minus infinity."""
     assert isinstance(header, KsplatHeader)
     into["sh_rest"][:] = 0
@@ -179,7 +168,7 @@ def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     for section in header.sections:
         buckets = _buckets(file, section) if header.level and section["count"] else None
         kind, steps = _row(header.level, section["degree"]), section["steps"] or _STEPS
-        for part, rows in row_blocks(file, kind, section["data"], section["count"]):
+        for part, rows in scene_format.row_blocks(file, kind, section["data"], section["count"]):
             block = slice(first + part.start, first + part.stop)
             positions = rows["position"].astype(np.float64)
             if buckets is not None:
@@ -191,21 +180,21 @@ def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
                     )
                 positions = (positions - steps) * (section["side"] / 2 / steps) + centers[owners]
             into["means"][block] = positions
-            scales = logarithms(file.path, rows["scale"].astype(np.float64))
+            scales = scene_format.logarithms(file.path, rows["scale"].astype(np.float64))
             into["scales"][block] = np.maximum(scales, _MIN_LOG_SCALE) if header.level else scales
             into["quats"][block] = rows["rotation"]
             into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
-            into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
-            harmonics = _harmonics(rows["harmonics"], header, COEFFICIENTS[section["degree"]])
+            into["opacities"][block] = scene_format.OPACITY_LOGITS[rows["color"][:, 3]]
+            harmonics = _harmonics(rows["harmonics"], header, scene_format.COEFFICIENTS[section["degree"]])
             into["sh_rest"][block, : harmonics.shape[1]] = harmonics
         first += section["count"]
 
 
-def _buckets(file: OpenScene, section: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _buckets(file: scene_format.OpenScene, section: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the end of each bucket, as an index of Gaussians, and the bucket's center, [buckets, 3]."""
     full, partial = section["full"], section["partial"]
-    lengths = read_rows(file, np.dtype("<u4"), section["start"], partial)
-    centers = read_rows(file, np.dtype("<f4"), section["start"] + 4 * partial, 3 * (full + partial))
+    lengths = scene_format.read_rows(file, np.dtype("<u4"), section["start"], partial)
+    centers = scene_format.read_rows(file, np.dtype("<f4"), section["start"] + 4 * partial, 3 * (full + partial))
     sizes = np.concatenate([np.full(full, section["bucket_size"], np.int64), lengths.astype(np.int64)])
     return sizes.cumsum(), centers.reshape(-1, 3).astype(np.float64)
 
@@ -219,4 +208,4 @@ def _harmonics(values: NDArray[np.generic], header: KsplatHeader, coefficients: 
     return low + (high - low) * (numbers / 255)
 
 
-KSPLAT = SceneFormat("ksplat", ".ksplat", 44, _matches_ksplat, _read_ksplat_header, _read_ksplat)
+KSPLAT = scene_format.SceneFormat("ksplat", ".ksplat", 44, _matches_ksplat, _read_ksplat_header, _read_ksplat)

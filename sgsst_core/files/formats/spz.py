@@ -31,28 +31,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.formats.scene_format import (
-    COEFFICIENTS,
-    OPACITY_LOGITS,
-    STORED_COEFFICIENTS,
-    UNTAGGED,
-    Arrays,
-    FileStart,
-    OpenScene,
-    RenderTag,
-    SceneFormat,
-    SceneHeader,
-    blocks,
-    harmonics_matrix,
-    join_bits,
-    opacity_bytes,
-    read_bytes,
-    read_rows,
-    stated,
-    truncated,
-    with_largest,
-    without_largest,
-)
+from sgsst_core.files.formats import scene_format
 from sgsst_core.scene.rendering import Rendering
 
 #: Requested axes; "auto" for those that the file states, else RUB.
@@ -106,7 +85,7 @@ Take = Callable[[int], bytes]
 
 
 @dataclass(frozen=True)
-class SpzHeader(SceneHeader):
+class SpzHeader(scene_format.SceneHeader):
     """Header of an SPZ file.
 
     Attributes:
@@ -140,17 +119,17 @@ class SpzHeader(SceneHeader):
         return self.stated_axes is not None or (self.extended and not self.streams)
 
 
-def _is_version_4(start: FileStart) -> bool:
+def _is_version_4(start: scene_format.FileStart) -> bool:
     """Return whether a file is SPZ of version 4, or of one that cannot be read."""
     return start.head.startswith(_MAGIC) and start.head[4:8] not in _OLD_VERSIONS
 
 
-def _is_old_version(start: FileStart) -> bool:
+def _is_old_version(start: scene_format.FileStart) -> bool:
     """Return whether a file is SPZ of version 1 to 3, or another gzip stream."""
     return start.head.startswith(_GZIP_MAGIC) or (start.head.startswith(_MAGIC) and not _is_version_4(start))
 
 
-def _old_header(file_start: FileStart) -> SpzHeader:
+def _old_header(file_start: scene_format.FileStart) -> SpzHeader:
     """Read the header of version 1 to 3, which stores header and sections in one stream."""
     path, head = file_start.path, file_start.head
     zipped = head.startswith(_GZIP_MAGIC)
@@ -164,11 +143,11 @@ def _old_header(file_start: FileStart) -> SpzHeader:
     needed = 16 + sum(header.sections)
     if needed > (_DEFLATE_RATIO if zipped else 1) * header.size:
         declared = f"the header declares {header.count} Gaussians, which take {needed} bytes"
-        raise truncated(path, f"{declared}, more than the file's {header.size} bytes can hold")
+        raise scene_format.truncated(path, f"{declared}, more than the file's {header.size} bytes can hold")
     return replace(header, format=SPZ_3, zipped=zipped, tag=_tag(start[14], header))
 
 
-def _zstd_header(file_start: FileStart) -> SpzHeader:
+def _zstd_header(file_start: scene_format.FileStart) -> SpzHeader:
     """Read the header of version 4, which is uncompressed and followed by one zstd stream per section."""
     path, head, size = file_start.path, file_start.head, file_start.size
     header = _shared_fields(file_start, head, 32, (4,))
@@ -176,32 +155,32 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
     expected = [section for section in header.sections if section]
     if number != len(expected) or table < 32 or table + 16 * number > size:
         declared = f"the SPZ header declares {number} streams with their table at byte {table}"
-        raise truncated(path, f"{declared}; expected {len(expected)} streams in {size} bytes")
-    records = read_bytes(path, 32, min(table, 32 + _EXTENSION_BYTES))
+        raise scene_format.truncated(path, f"{declared}; expected {len(expected)} streams in {size} bytes")
+    records = scene_format.read_bytes(path, 32, min(table, 32 + _EXTENSION_BYTES))
     axes, _ = _parsed_extensions(path, records, header)
     position = table + 16 * number
-    streams, listed = [], list(struct.iter_unpack("<QQ", read_bytes(path, table, position)))
+    streams, listed = [], list(struct.iter_unpack("<QQ", scene_format.read_bytes(path, table, position)))
     for (compressed, decompressed), wanted in zip(listed, expected, strict=True):
         if decompressed != wanted or position + compressed > size or wanted > _ZSTD_RATIO * compressed:
             declared = f"the SPZ header declares a stream of {compressed} bytes that become {decompressed}"
             needed = f"{wanted} belong to {header.count} Gaussians, and {size - position} bytes are left"
-            raise truncated(path, f"{declared}; {needed}")
+            raise scene_format.truncated(path, f"{declared}; {needed}")
         streams.append((position, compressed))
         position += compressed
     return replace(header, streams=tuple(streams), stated_axes=axes, tag=_tag(head[14], header))
 
 
-def _tag(flags: int, header: SpzHeader) -> RenderTag:
+def _tag(flags: int, header: SpzHeader) -> scene_format.RenderTag:
     """Return the render mode that the flags state; if the flag is ignored, return the default mode with a warning."""
     if not flags & _ANTIALIASED:
-        return UNTAGGED
+        return scene_format.UNTAGGED
     if header.version > 3 or header.extended or header.fractional_bits != _USUAL_BITS:
-        return stated("antialiased", "the file's flag")
+        return scene_format.stated("antialiased", "the file's flag")
     reason = (
         "the file's flag says antialiased, but Spark sets it for all scenes; if the scene was trained so, add "
         "--render-mode antialiased"
     )
-    return RenderTag(warnings=(("classic", reason),))
+    return scene_format.RenderTag(warnings=(("classic", reason),))
 
 
 def _parsed_extensions(path: Path, data: bytes, spz: SpzHeader) -> tuple[str | None, bytes]:
@@ -227,7 +206,7 @@ def _parsed_extensions(path: Path, data: bytes, spz: SpzHeader) -> tuple[str | N
     return axes, data[position:]
 
 
-def _shared_fields(start: FileStart, head: bytes, least: int, versions: tuple[int, ...]) -> SpzHeader:
+def _shared_fields(start: scene_format.FileStart, head: bytes, least: int, versions: tuple[int, ...]) -> SpzHeader:
     """Parse the fields that all versions share, of a header of at least some bytes."""
     path = start.path
     if len(head) < least:
@@ -238,7 +217,7 @@ def _shared_fields(start: FileStart, head: bytes, least: int, versions: tuple[in
             f"{path}: is SPZ of version {version}{' in a gzip stream' * (version == 4)}, which cannot be read. Export "
             "it as SPZ 4 or 3, or as PLY."
         )
-    if degree not in STORED_COEFFICIENTS:
+    if degree not in scene_format.STORED_COEFFICIENTS:
         raise SceneError(f"{path}: has SH degree {degree}; 0 to 4 can be read. Export it as PLY.")
     if head[14] & _LEVELS:
         raise SceneError(
@@ -257,9 +236,9 @@ def _shared_fields(start: FileStart, head: bytes, least: int, versions: tuple[in
         3 * count,
         3 * count,
         (3 if version < 3 else 4) * count,
-        3 * STORED_COEFFICIENTS[degree] * count,
+        3 * scene_format.STORED_COEFFICIENTS[degree] * count,
     )
-    drawn, extended = COEFFICIENTS[min(degree, 3)], bool(head[14] & _HAS_EXTENSIONS)
+    drawn, extended = scene_format.COEFFICIENTS[min(degree, 3)], bool(head[14] & _HAS_EXTENSIONS)
     notes = ("SH bands above degree 3 are left out",) if degree > 3 else ()
     return SpzHeader(
         *(SPZ, count, drawn, start.size, version, degree, fractional_bits, sections),
@@ -268,19 +247,21 @@ def _shared_fields(start: FileStart, head: bytes, least: int, versions: tuple[in
     )
 
 
-def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> SpzHeader:
+def _read(file: scene_format.OpenScene, spz: scene_format.SceneHeader, into: scene_format.Arrays) -> SpzHeader:
     """Fill the arrays of a scene, and return the header with its axes, and further notes."""
     assert isinstance(spz, SpzHeader)
     path = file.path
     decoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.uint8]], NDArray[Any]]]] = [
         (into["means"], lambda data: _positions(data, spz)),
-        (into["opacities"], lambda data: OPACITY_LOGITS[data]),
+        (into["opacities"], lambda data: scene_format.OPACITY_LOGITS[data]),
         (into["sh_dc"], lambda data: _COLORS[data].reshape(-1, 3)),
         (into["scales"], lambda data: _SCALES[data].reshape(-1, 3)),
         (into["quats"], _smallest_three if spz.version >= 3 else _first_three),
         (
             into["sh_rest"],
-            lambda data: _HARMONICS[data].reshape(-1, STORED_COEFFICIENTS[spz.degree], 3)[:, : COEFFICIENTS[3]],
+            lambda data: _HARMONICS[data].reshape(-1, scene_format.STORED_COEFFICIENTS[spz.degree], 3)[
+                :, : scene_format.COEFFICIENTS[3]
+            ],
         ),
     ]
     stream = _Stream(file, spz)
@@ -293,7 +274,7 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> SpzHeader:
             continue
         take = next(takes)
         row_bytes = size // spz.count
-        for block in blocks(spz.count):
+        for block in scene_format.blocks(spz.count):
             array[block] = decode(np.frombuffer(take((block.stop - block.start) * row_bytes), np.uint8))
     next(takes, None)  # reach the end of the last stream, where its checksum is verified
     axes, notes = spz.stated_axes, spz.notes
@@ -306,7 +287,7 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> SpzHeader:
     axes = axes or _AXES[0]
     if axes != "rdf":
         for name, array in into.items():
-            for block in blocks(len(array)):
+            for block in scene_format.blocks(len(array)):
                 array[block] = _with_axes(name, array[block], _matrix(axes))
     return replace(spz, axes=axes, notes=notes)
 
@@ -331,7 +312,7 @@ def _with_axes(name: str, values: NDArray[Any], matrix: NDArray[np.float64]) -> 
         case "quats":  # the axis of a rotation is mirrored the other way
             values = np.hstack([values[:, :1], values[:, 1:][:, order] * signs * round(np.linalg.det(matrix))])
         case "sh_rest":
-            harmonics = harmonics_matrix(matrix, values.shape[1]).astype(values.dtype)
+            harmonics = scene_format.harmonics_matrix(matrix, values.shape[1]).astype(values.dtype)
             flips = np.array_equal(np.abs(harmonics), np.eye(len(harmonics)))
             values = values * harmonics.diagonal()[:, None] if flips else harmonics @ values
     return values
@@ -344,13 +325,15 @@ class _Part:
         position: Byte offset of what is read next.
     """
 
-    def __init__(self, file: OpenScene, offset: int, size: int) -> None:
+    def __init__(self, file: scene_format.OpenScene, offset: int, size: int) -> None:
         self.position = offset
         self._file, self._end = file, offset + size
 
     def read(self, size: int = -1) -> bytes:
         left = self._end - self.position
-        data = read_rows(self._file, np.dtype(np.uint8), self.position, left if size < 0 else min(size, left))
+        data = scene_format.read_rows(
+            self._file, np.dtype(np.uint8), self.position, left if size < 0 else min(size, left)
+        )
         self.position += len(data)
         return data.tobytes()
 
@@ -362,7 +345,7 @@ class _Stream:
         inflate: Decompressor; None for a stream that is not compressed.
     """
 
-    def __init__(self, file: OpenScene, spz: SpzHeader) -> None:
+    def __init__(self, file: scene_format.OpenScene, spz: SpzHeader) -> None:
         self.source = _Part(file, 0, spz.size)
         self.inflate = zlib.decompressobj(31) if spz.zipped else None
 
@@ -385,14 +368,14 @@ def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> str | None:
     if _taken(path, stream.read, 1, least=0):
         raise _too_much(path)
     if stream.inflate and not stream.inflate.eof:
-        raise truncated(path, _ENDS_EARLY)
+        raise scene_format.truncated(path, _ENDS_EARLY)
     axes, rest = _parsed_extensions(path, content, spz)
     if len(rest.strip(b"\0")) >= sum(spz.sections) // spz.count:
         raise _too_much(path)
     return axes
 
 
-def _sections_of_streams(path: Path, file: OpenScene, spz: SpzHeader) -> Iterator[Take]:
+def _sections_of_streams(path: Path, file: scene_format.OpenScene, spz: SpzHeader) -> Iterator[Take]:
     """Yield, for each section of version 4, a function that reads its own stream; check that the stream ends there."""
     for offset, size in spz.streams:
         part: Any = _Part(file, offset, size)  # its only method is `read`
@@ -411,7 +394,7 @@ def _taken(path: Path, read: Take, count: int, least: int | None = None) -> byte
     except (zlib.error, zstd.ZstdError) as error:
         raise SceneError(f"{path}: the compressed data is damaged: {error}. Copy or export it again.") from error
     if len(content) < (count if least is None else least):
-        raise truncated(path, _ENDS_EARLY)
+        raise scene_format.truncated(path, _ENDS_EARLY)
     return content
 
 
@@ -433,7 +416,7 @@ def _positions(data: NDArray[np.uint8], spz: SpzHeader) -> NDArray[Any]:
 
 def _first_three(data: NDArray[np.uint8]) -> NDArray[Any]:
     xyz = _FIRST_BYTES[data].reshape(-1, 3).astype(np.float64)
-    return with_largest(np.zeros(len(xyz), np.int64), xyz)
+    return scene_format.with_largest(np.zeros(len(xyz), np.int64), xyz)
 
 
 def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
@@ -441,10 +424,10 @@ def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
     packed = data.view("<u4")
     three = np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1)
     values = np.where(three & 512, -1.0, 1.0) * (three & 511) / 511 * np.sqrt(0.5)
-    return np.roll(with_largest(packed >> 30, values), 1, axis=1)
+    return np.roll(scene_format.with_largest(packed >> 30, values), 1, axis=1)
 
 
-def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering, axes: str = _AXES[0]) -> None:
+def _write(output: BinaryIO, arrays: scene_format.Arrays, rendering: Rendering, axes: str = _AXES[0]) -> None:
     """Write SPZ version 4, the newest, with all 8 bits of SH coefficients, and a record of its axes."""
     bits = _fractional_bits(arrays["means"])
     streams = []
@@ -466,7 +449,7 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering, axes: str = _
         output.write(compressed)
 
 
-def _write_version_3(output: BinaryIO, arrays: Arrays, rendering: Rendering, axes: str = _AXES[0]) -> None:
+def _write_version_3(output: BinaryIO, arrays: scene_format.Arrays, rendering: Rendering, axes: str = _AXES[0]) -> None:
     """Write SPZ version 3, for programs that cannot read version 4, with all 8 bits of SH coefficients.
 
     Axes other than RDF become RUB, because the file does not state them.
@@ -480,18 +463,18 @@ def _write_version_3(output: BinaryIO, arrays: Arrays, rendering: Rendering, axe
     output.write(deflate.flush())
 
 
-def _first_fields(version: int, arrays: Arrays, bits: int, rendering: Rendering, flags: int = 0) -> bytes:
+def _first_fields(version: int, arrays: scene_format.Arrays, bits: int, rendering: Rendering, flags: int = 0) -> bytes:
     """Return the first 15 bytes of a header, which versions 2 to 4 share."""
     count, coefficients = arrays["sh_rest"].shape[:2]
     flags |= _ANTIALIASED if rendering.antialiased else 0
     return struct.pack("<4sIIBBB", _MAGIC, version, count, SH_DEGREES[coefficients], bits, flags)
 
 
-def _encoded_sections(arrays: Arrays, bits: int, axes: str) -> Iterator[Iterator[bytes]]:
+def _encoded_sections(arrays: scene_format.Arrays, bits: int, axes: str) -> Iterator[Iterator[bytes]]:
     """Yield the blocks of each section of version 3 and 4."""
     encoders: dict[str, Callable[[NDArray[np.float64]], NDArray[Any]]] = {
         "means": lambda values: _encode_positions(values, bits),
-        "opacities": opacity_bytes,
+        "opacities": scene_format.opacity_bytes,
         "sh_dc": lambda values: _to_byte(values * (0.15 * 255) + 127.5),
         "scales": lambda values: _to_byte((values + 10) * 16),
         "quats": _encode_rotations,
@@ -500,7 +483,7 @@ def _encoded_sections(arrays: Arrays, bits: int, axes: str) -> Iterator[Iterator
     matrix = _matrix(axes).T
 
     def encoded(name: str) -> Iterator[bytes]:
-        for block in blocks(len(arrays[name])):
+        for block in scene_format.blocks(len(arrays[name])):
             values = _with_axes(name, arrays[name][block].astype(np.float64), matrix)
             yield np.ascontiguousarray(encoders[name](values)).tobytes()
 
@@ -524,16 +507,16 @@ def _encode_positions(means: NDArray[np.float64], bits: int) -> NDArray[Any]:
 
 
 def _encode_rotations(quats: NDArray[np.float64]) -> NDArray[Any]:
-    largest, three = without_largest(np.roll(quats, -1, axis=1))
+    largest, three = scene_format.without_largest(np.roll(quats, -1, axis=1))
     components = np.stack([three < 0, np.abs(three) / np.sqrt(0.5)], axis=2).reshape(-1, 6)
-    return join_bits(np.column_stack([largest / 3, components]), (2, 1, 9, 1, 9, 1, 9)).astype("<u4")
+    return scene_format.join_bits(np.column_stack([largest / 3, components]), (2, 1, 9, 1, 9, 1, 9)).astype("<u4")
 
 
 def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-SPZ = SceneFormat(
+SPZ = scene_format.SceneFormat(
     *("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write),
     ranges={"scales": (_SCALES[0], _SCALES[-1]), "sh_dc": (_COLORS[0], _COLORS[-1]), "sh_rest": (-1.0, 1.0)},
     step=lambda means: np.ldexp(1.0, -_fractional_bits(means)),
