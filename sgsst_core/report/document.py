@@ -354,7 +354,7 @@ def machine(device: torch.device) -> dict[str, Any]:
     """Describe the machine that ran the job."""
     return {
         "system": platform.platform(),
-        "processor": _processor(),
+        "processor": processor(),
         "cores": container.cores(),
         "threads": torch.get_num_threads(),
         "memory_bytes": container.memory().total,
@@ -364,7 +364,8 @@ def machine(device: torch.device) -> dict[str, Any]:
     }
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Return the processor's name, or its architecture if the name is unknown."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
         return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
