@@ -19,8 +19,10 @@ from pathlib import Path
 import psutil
 
 _PR_SET_PDEATHSIG = 1
-#: Signals that ask a program to stop: Ctrl-C, the usual one, and that of a closed terminal, which Windows lacks.
-STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+#: Signal of a closed terminal; None on Windows, which lacks it.
+HANGUP = getattr(signal, "SIGHUP", None)
+#: Signals that ask a program to stop: Ctrl-C, the usual one, and that of a closed terminal.
+STOP_SIGNALS = [number for number in (signal.SIGINT, signal.SIGTERM, HANGUP) if number is not None]
 
 #: Message to a sweeper whose owner has deleted the folder itself.
 _DONE = b"done"

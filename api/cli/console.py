@@ -1,17 +1,19 @@
 """Consoles of the command line, what is printed there by several commands, and exit codes."""
 
+import errno
 import os
-import signal
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
 from sgsst_core.scales import ratio
+from worker.processes import HANGUP
 
 #: Exit codes: an unusable input or option, and any other failure.
 BAD_INPUT, FAILURE = 2, 1
@@ -56,7 +58,11 @@ class Invocation:
 
 
 class PlainConsole(Console):
-    """Console that prints texts as they are, but without control characters: a service could send any."""
+    """Console that prints texts as they are, but without control characters: a service could send any.
+
+    It discards what it cannot print because the terminal is closed. Whether the program stops is decided by the signal,
+    which arrives later, or never if it is ignored.
+    """
 
     def __init__(self, *, stderr: bool = False, soft_wrap: bool = False) -> None:
         super().__init__(stderr=stderr, soft_wrap=soft_wrap, highlight=False, markup=False, emoji=False)
@@ -65,6 +71,15 @@ class PlainConsole(Console):
         """Yield the segments of a text, table or progress bar; those with control codes are the console's own."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=segment.text.translate(_CONTROLS))
+
+    def __exit__(self, *exception: Any) -> None:
+        """Print what was collected in the block: every text, table and progress bar is printed here."""
+        try:
+            super().__exit__(*exception)
+        except OSError as error:
+            if error.errno != errno.EIO or not stat.S_ISCHR(os.fstat(self.file.fileno()).st_mode):
+                raise
+            leave_terminal(HANGUP)
 
 
 out_console = PlainConsole(soft_wrap=True)
@@ -98,11 +113,9 @@ def counting_bar(description: str, *, in_bytes: bool = True) -> Iterator[Callabl
         yield lambda done, total: bar.update(task, completed=done, total=total or None)
 
 
-def leave_terminal(number: int) -> None:
+def leave_terminal(number: int | None) -> None:
     """Discard what is written to a terminal from now on if a signal says that it is closed: writing would fail."""
-    if number != getattr(signal, "SIGHUP", None):
-        return
     with Path(os.devnull).open("wb") as nowhere:
         for descriptor in (1, 2):
-            if stat.S_ISCHR(os.fstat(descriptor).st_mode):
+            if number == HANGUP and stat.S_ISCHR(os.fstat(descriptor).st_mode):
                 os.dup2(nowhere.fileno(), descriptor)

@@ -22,7 +22,7 @@ from rich.table import Table
 from api.cli.console import FAILURE, PlainConsole, counting_bar, error_console, leave_terminal, out_console
 from api.cli.options import JsonOption
 from sgsst_core.errors import SettingsError
-from worker.processes import STOP_SIGNALS
+from worker.processes import HANGUP, STOP_SIGNALS
 
 if TYPE_CHECKING:
     from service.settings import ServiceSettings
@@ -136,7 +136,7 @@ _BACKLOG = 1024
 def run_service(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
     """Run API and dispatcher until SIGTERM, Ctrl-C or the end of the terminal; running jobs then save their state.
 
-    A second signal ends at once. Either process is started again when it dies.
+    A second Ctrl-C or SIGTERM ends at once. Either process is started again when it dies.
 
     This process owns the listening socket, so that connections wait during a restart of the API instead of being
     refused.
@@ -230,7 +230,11 @@ def _run(
     for process in processes:
         process.send_signal(signal.SIGTERM)
     deadline = time.monotonic() + settings.stop_seconds + _LAST_SECONDS
-    while any(process.poll() is None for process in processes) and len(signals) < 2 and time.monotonic() < deadline:
+    while (
+        any(process.poll() is None for process in processes)
+        and set(signals[1:]) <= {HANGUP}
+        and time.monotonic() < deadline
+    ):
         time.sleep(0.05)
     for process in processes:
         if process.poll() is None:

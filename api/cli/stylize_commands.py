@@ -39,7 +39,7 @@ from sgsst_core.progress import job_bar
 from sgsst_core.settings import declared
 from worker.job import JobSpec, Outputs, Result, check_is_not_input, check_request
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
-from worker.processes import STOP_SIGNALS
+from worker.processes import HANGUP, STOP_SIGNALS
 from worker.run import WorkerOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
@@ -220,21 +220,19 @@ class StopFlag:
 
     @contextmanager
     def on_signal(self, announce: Callable[[], None]) -> Iterator[None]:
-        """Set this flag at the first Ctrl-C, SIGTERM or SIGHUP, and call `announce`. The second has its usual effect.
+        """Set this flag at the first Ctrl-C, SIGTERM or SIGHUP, and call `announce`.
 
-        SIGHUP arrives when the terminal is closed; like others, it stays ignored if it is, as by `nohup`. Outside the
-        main thread, Python allows no signal handlers, so the flag stays unset.
+        A second Ctrl-C or SIGTERM has its usual effect. SIGHUP, which arrives when the terminal is closed, never has:
+        both the shell and the system send it. Like others, it stays ignored if it is, as by `nohup`. Outside the main
+        thread, Python allows no signal handlers, so the flag stays unset.
         """
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
-        before = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
+        numbers = STOP_SIGNALS if threading.current_thread() is threading.main_thread() else []
+        before = {number: handler for number in numbers if (handler := signal.getsignal(number)) != signal.SIG_IGN}
 
         def handle(number: int, _frame: FrameType | None) -> None:
             self._signal = number
             for other, handler in before.items():
-                signal.signal(other, handler)
+                signal.signal(other, handle if other == HANGUP else handler)
             console.leave_terminal(number)
             announce()
 
@@ -244,7 +242,8 @@ class StopFlag:
             yield
         finally:
             for number, handler in before.items():
-                signal.signal(number, handler)
+                if number != self._signal:  # else a second SIGHUP would still end the program
+                    signal.signal(number, handler)
 
 
 # --- batch ---------------------------------------------------------------------------------------------------------

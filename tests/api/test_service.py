@@ -275,7 +275,9 @@ def test_restart_resumes_running_jobs(files: dict[str, Path], expected: bytes, t
     with Service(tmp_path / "data") as service, service.client() as client:
         job_id = submit(client, files)
         wait_for_step(service, client, job_id, 10)
-        service.stop(signal.SIGINT)
+        wait_for(lambda: service.process("api.cli"), "the process", service.said).send_signal(signal.SIGINT)
+        wait_for(lambda: "running jobs save their state" in service.said(), "the announcement", service.said)
+        service.stop(signal.SIGHUP)  # the terminal is closed before the end
         service.start()
         ended = wait_until(service, client, job_id, "succeeded")
         assert [attempt["outcome"] for attempt in ended["attempts"]] == ["released", "succeeded"]

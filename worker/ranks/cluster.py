@@ -26,7 +26,7 @@ import psutil
 from sgsst_core import container
 from sgsst_core.errors import ClusterAwayError, RanksFailedError, SettingsError
 from worker.job import memory_beside_gpus
-from worker.processes import STOP_SIGNALS, dismiss_sweeper, start_sweeper, sweep
+from worker.processes import HANGUP, STOP_SIGNALS, dismiss_sweeper, start_sweeper, sweep
 
 #: Size of Ray's object store in bytes. The default is 30 % of all memory, but the store holds almost nothing here:
 #: torch.distributed exchanges tensors, and scenes are read from files.
@@ -77,8 +77,8 @@ class Cluster:
         """
         before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
         try:
-            if hasattr(signal, "SIGHUP"):  # Ray's processes inherit this: they must outlast a closed terminal
-                signal.signal(signal.SIGHUP, signal.SIG_IGN)
+            if HANGUP is not None:  # Ray's processes inherit this: they must outlast a closed terminal
+                signal.signal(HANGUP, signal.SIG_IGN)
             with contextlib.chdir("/"):  # Ray lets its processes import modules from the current folder
                 if self.address is None:
                     self._start()

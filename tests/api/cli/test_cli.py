@@ -279,20 +279,45 @@ def test_resume_after_ctrl_c_is_bit_identical(files: Files, capfd: pytest.Captur
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [(), ("--workers", "2")])
-def test_closed_terminal_saves(files: Files, workers: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    ("hangup", "workers", "code", "name"),
+    [
+        ("--default-signal=HUP", (), 128 + signal.SIGHUP, "stylized.checkpoint.safetensors"),
+        ("--default-signal=HUP", ("--workers", "2"), 128 + signal.SIGHUP, "stylized.checkpoint.safetensors"),
+        ("--ignore-signal=HUP", (), 0, "stylized.report.json"),  # printing fails without a signal
+    ],
+)
+def test_closed_terminal_saves_unless_ignored(
+    files: Files, hangup: str, workers: tuple[str, ...], code: int, name: str
+) -> None:
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "120"}
     environment.pop("RAY_ADDRESS", None)
     ours, theirs = pty.openpty()
     command = [sys.executable, "-m", "api.cli", *files.stylize("--steps-sos", "400", "--no-early-stop", *workers)]
     with subprocess.Popen(
-        ["setsid", "--ctty", *command], stdin=theirs, stdout=theirs, stderr=theirs, env=environment
+        ["env", hangup, "setsid", "--ctty", *command], stdin=theirs, stdout=theirs, stderr=theirs, env=environment
     ) as process:
         os.close(theirs)
         _shown_until(ours, r" [1-9]\d*/400")
         os.close(ours)
-        assert process.wait(timeout=120) == 128 + signal.SIGHUP
-    assert files.out.with_name("stylized.checkpoint.safetensors").exists()
+        assert process.wait(timeout=120) == code
+    assert files.out.with_name(name).exists()
+
+
+def test_closed_terminal_never_aborts() -> None:
+    """SIGHUP arrives after Ctrl-C and twice: from the shell, and from the system when the shell ends."""
+    lines = [
+        "import signal",
+        "from api.cli.stylize_commands import StopFlag",
+        "stop = StopFlag()",
+        "with stop.on_signal(lambda: None):",
+        "    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGHUP):",
+        "        signal.raise_signal(number)",
+        "signal.raise_signal(signal.SIGHUP)",
+        "raise SystemExit(stop.exit_code)",
+    ]
+    command = ["env", "--default-signal=HUP", sys.executable, "-c", "\n".join(lines)]
+    assert subprocess.run(command, cwd=ROOT, check=False).returncode == 128 + signal.SIGHUP
 
 
 def _shown_until(terminal: int, pattern: str | None) -> str:
