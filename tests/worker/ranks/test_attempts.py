@@ -86,11 +86,14 @@ def run(
     fault: Fault | None = None,
     workers: int = 2,
 ) -> Ended:
-    """Run a job on ranks, optionally with a fault, with a checkpoint after almost every step."""
+    """Run a job on ranks, optionally with a fault, with a checkpoint after almost every step.
+
+    Ranks without a fault may take long: on a busy machine, one compiles kernels for minutes while the other waits.
+    """
     if fault is not None:
         fault.write(request)
     options = WorkerOptions(
-        rank_timeout=5.0,
+        rank_timeout=WorkerOptions.rank_timeout if fault is None else 5.0,
         checkpoint_seconds=0.2,
         preview_folder=request.out.with_name("previews"),
         preview_seconds=0.1,
