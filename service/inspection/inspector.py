@@ -258,8 +258,12 @@ class Inspector:
             INVALID_INPUT: If the inputs cannot be used.
             BUSY: If the inputs cannot be checked now.
         """
-        key = await asyncio.to_thread(_key, self._settings, work, owner, inputs, parameters)
-        known = await asyncio.to_thread(self._store.inputs.inspection, key)
+
+        def find() -> tuple[str, dict[str, Any] | None]:
+            key = _key(self._settings, work, owner, inputs, parameters)
+            return key, self._store.inputs.inspection(key)
+
+        key, known = await asyncio.to_thread(find)
         if known is not None:
             return findings_of(known)
         seconds = self._settings.inspection_seconds + _SECONDS_PER_BYTE * _size(inputs)
