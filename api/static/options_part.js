@@ -76,7 +76,8 @@ export class OptionsPart {
   follow(preset) {
     this.preset = preset;
     for (const control of this.controls.values()) control.follow(preset);
-    if (this.controls.get("within")?.value() !== undefined) for (const name of ["resolution", "views"]) this.controls.get(name)?.suggest(say.byTime);
+    if (this.controls.get("within")?.value() === undefined) return;
+    for (const [name, text] of [["resolution", say.byTime], ["views", say.byTime], ["early_stop", say.off]]) this.controls.get(name)?.suggest(text);
   }
 
   /** Return the values that are not left to the preset, by name. @param {Control[]} [controls] @returns {Record<string, any>} */

@@ -184,9 +184,12 @@ def test_defaults_are_those_of_the_chosen_preset(visit: Visit) -> None:
     page = visit().page
     resolution = page.locator("[data-name=resolution] input")
     resolution.wait_for()
+    early_stop = page.locator("[data-name=early_stop] option").first
     assert resolution.get_attribute("placeholder") == "fits the time"
+    assert early_stop.text_content() == "off (default)"
     page.locator("[data-name=within] input").fill("")
     assert resolution.get_attribute("placeholder") == "the cameras' own"
+    assert early_stop.text_content() == "on (default)"
     page.get_by_label("preview").check(force=True)
     assert resolution.get_attribute("placeholder") == "640"
     assert page.locator("[data-name=bounded] option").first.text_content() == "on (default)"
