@@ -674,7 +674,7 @@ def _queue_job(
     response_headers = {"Location": address(f"/v1/jobs/{job.id}"), "Retry-After": "2"}
     if not created:
         response_headers["Idempotency-Replayed"] = "true"
-    shown, _ = jobs.detail(job.id, caller.owner)
+    shown = jobs.shown_new(job) if created else jobs.detail(job.id, caller.owner)[0]
     body = job_view(shown).model_dump_json()
     return Response(body, 202, response_headers, media_type="application/json")
 

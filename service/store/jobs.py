@@ -12,13 +12,13 @@ import hmac
 import json
 import re
 import secrets
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service import problems, states
@@ -47,7 +47,7 @@ _WAITING_PROGRESS = (
     .where(DeliveryRow.job_id == sa.bindparam("job_id"), DeliveryRow.body["type"].as_string() == PROGRESS_MESSAGE)
     .with_for_update()
 )
-_EVENTS = Base.metadata.tables[EventRow.__tablename__]
+_ADD_EVENT = sa.insert(Base.metadata.tables[EventRow.__tablename__]).inline()
 
 
 def job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
@@ -127,7 +127,7 @@ def add_status_event(session: Session, job: JobRow, now: float) -> None:
 
 def add_event(session: Session, job_id: str, kind: str, data: dict[str, Any], now: float) -> None:
     """Add an event to a job."""
-    session.execute(sa.insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
+    session.execute(_ADD_EVENT, {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
 
 
 def put_artifact(session: Session, job_id: str, file: states.Published, now: float) -> list[str]:
@@ -204,31 +204,15 @@ _ENTRIES = {
 }
 
 
-def _counts_and_named(
-    connection: sa.Connection, job_ids: Sequence[str]
-) -> tuple[dict[str, dict[str, int]], dict[str, list[dict[str, Any]]]]:
-    """Return the number of files by role of each job, and its entries of scene, style images and camera files."""
-    counts: dict[str, dict[str, int]] = {job_id: {} for job_id in job_ids}
-    named: dict[str, list[dict[str, Any]]] = {job_id: [] for job_id in job_ids}
-    if job_ids:  # PostgreSQL compares with no type in an empty list
-        of_jobs, queries = {"ids": list(job_ids)}, _queries(connection.dialect.name)
-        for job_id, role, number in connection.execute(queries["counts"], of_jobs):
-            counts[job_id][role] = number
-        for job_id, entry in connection.execute(queries["named"], {**of_jobs, "roles": list(_NAMED_ROLES)}):
-            named[job_id].append(json.loads(entry))
-    return counts, named
-
-
 @cache
 def _queries(dialect: str) -> dict[str, sa.TextClause]:
     table, position, value, role = _ENTRIES[dialect]
     of_jobs = f"FROM jobs, {table} WHERE jobs.id IN :ids"
-    of_role = f"{of_jobs} AND {role} IN :roles ORDER BY jobs.id, {position}"
     index = f"row_number() OVER (PARTITION BY {role} ORDER BY {position}) - 1"
     texts = {
-        "counts": f"SELECT jobs.id, {role}, count(*) {of_jobs} GROUP BY jobs.id, {role}",
-        "named": f"SELECT jobs.id, {value} {of_role}",
-        "one": f"SELECT {value} {of_role} LIMIT 1 OFFSET :index",
+        "shown": f"SELECT jobs.id, {role} AS role, CASE WHEN {role} IN :roles THEN {value} END AS shown, count(*) "
+        f"{of_jobs} GROUP BY jobs.id, role, shown ORDER BY min({position})",
+        "one": f"SELECT {value} {of_jobs} AND {role} IN :roles ORDER BY {position} LIMIT 1 OFFSET :index",
         "page": f"SELECT number, value FROM (SELECT {position} AS position, {value} AS value, {index} AS number "
         f"{of_jobs}) AS entries WHERE position >= :start ORDER BY position LIMIT :most",
     }
@@ -240,33 +224,42 @@ def _queries(dialect: str) -> dict[str, sa.TextClause]:
     }
 
 
-_JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
-    Base.metadata.tables[name] for name in ("jobs", "attempts", "artifacts", "blob_uses")
+_JOBS, _ATTEMPTS, _ARTIFACTS, _BLOBS, _BLOB_USES = (
+    Base.metadata.tables[name] for name in ("jobs", "attempts", "artifacts", "blobs", "blob_uses")
 )
 # Frequent queries are built once, because building a query takes longer than running it.
-_SHOWN_JOBS = sa.select(*(column for column in _JOBS.c if column.name != "inputs"))
-_JOB = _SHOWN_JOBS.where(_JOBS.c.id == sa.bindparam("job_id"))
-_ATTEMPTS_OF = sa.select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == sa.bindparam("job_id")).order_by(_ATTEMPTS.c.number)
-# Names of previews sort by step.
-_NEWEST_PREVIEWS = (
-    sa.select(_ARTIFACTS.c.job_id, sa.func.max(_ARTIFACTS.c.name).label("newest"))
-    .where(_ARTIFACTS.c.job_id.in_(sa.bindparam("ids", expanding=True)), _ARTIFACTS.c.name.like("previews/%"))
-    .group_by(_ARTIFACTS.c.job_id)
-)
-_UNFINISHED_OF = sa.select(sa.func.count()).where(
-    _JOBS.c.owner == sa.bindparam("owner"), _JOBS.c.status.in_(states.UNFINISHED)
-)
-
-
-_QUEUED = sa.select(sa.func.count()).select_from(_JOBS).where(_JOBS.c.status == states.JobStatus.QUEUED)
-_OWN_POSITION = sa.tuple_(sa.bindparam("queued_at", type_=sa.Float), sa.bindparam("job_id", type_=sa.String))
-_HIGHER = _QUEUED.where(_JOBS.c.priority > sa.bindparam("priority"))
+_OTHERS = _JOBS.alias("others")
+_QUEUED = sa.select(sa.func.count()).select_from(_OTHERS).where(_OTHERS.c.status == states.JobStatus.QUEUED)
+_HIGHER = _QUEUED.where(_OTHERS.c.priority > _JOBS.c.priority)
 _EARLIER = _QUEUED.where(
-    _JOBS.c.priority == sa.bindparam("priority"), sa.tuple_(_JOBS.c.queued_at, _JOBS.c.id) < _OWN_POSITION
+    _OTHERS.c.priority == _JOBS.c.priority,
+    sa.tuple_(_OTHERS.c.queued_at, _OTHERS.c.id) < sa.tuple_(_JOBS.c.queued_at, _JOBS.c.id),
 )
-#: Number of the queued jobs ahead of a job, in two ranges of the queue's index.
-_AHEAD = sa.select(_HIGHER.scalar_subquery() + _EARLIER.scalar_subquery())
-
+#: One more than the number of queued jobs ahead of a queued job, which are in two ranges of the queue's index.
+_POSITION = sa.case(
+    (_JOBS.c.status == states.JobStatus.QUEUED, 1 + _HIGHER.scalar_subquery() + _EARLIER.scalar_subquery())
+)
+_PREVIEWS = sa.select(sa.func.max(_ARTIFACTS.c.name)).where(_ARTIFACTS.c.name.like("previews/%"))  # names sort by step
+_COLUMNS = [column for column in _JOBS.c if column.name != "inputs"]
+_SHOWN_JOBS = sa.select(*_COLUMNS, _POSITION, _PREVIEWS.where(_ARTIFACTS.c.job_id == _JOBS.c.id).scalar_subquery())
+_JOB, _POSITION_OF = (each.where(_JOBS.c.id == sa.bindparam("job_id")) for each in (_SHOWN_JOBS, sa.select(_POSITION)))
+_ATTEMPTS_OF = sa.select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == sa.bindparam("job_id")).order_by(_ATTEMPTS.c.number)
+# Their number is rendered once, unlike that of a list of values.
+_STATUSES = [sa.literal(status, sa.String) for status in states.UNFINISHED]
+_UNFINISHED_OF = sa.select(sa.func.count()).where(_JOBS.c.owner == sa.bindparam("owner"), _JOBS.c.status.in_(_STATUSES))
+_ADD_JOB = sa.insert(_JOBS)
+# Locks the blobs in the same order as `release_blobs`; one that is deleted meanwhile is left out.
+_HOLD = (
+    sa.insert(_BLOB_USES)
+    .from_select(
+        ("holder", "sha256"),
+        sa.select(sa.bindparam("holder", type_=sa.String), _BLOBS.c.sha256)
+        .where(_BLOBS.c.sha256.in_(sa.bindparam("digests", expanding=True)))
+        .order_by(_BLOBS.c.sha256)
+        .with_for_update(read=True, key_share=True),
+    )
+    .execution_options(preserve_rowcount=True)
+)
 
 #: Time in seconds after which a dispatcher without heartbeat is forgotten.
 _FORGET_SECONDS = 86_400.0
@@ -320,7 +313,7 @@ class ShownJob:
 
     row: JobRow
     inputs: list[dict[str, Any]]
-    input_counts: dict[str, int]
+    input_counts: Mapping[str, int]
     position: int | None
     preview: str | None
 
@@ -364,33 +357,39 @@ class Jobs:
             NotFoundError: If an input was deleted meanwhile.
         """
         now = self._database.clock()
+        values = new.row(now)
+        job = JobRow(**values)
         with self._database.writing() as session:
+            # before the lock, which the owner's other requests wait for, come rows that no other transaction sees
+            session.execute(_ADD_JOB, values)
+            add_status_event(session, job, now)
             lock_owner(session, new.owner)
-            used_key = None
             if idempotency is not None:
                 used_key = idempotency_row(session, new.owner, idempotency.key, idempotency.fingerprint, now)
-            known = session.get(JobRow, used_key.created_id) if used_key and used_key.created_id else None
-            if known is not None:
-                return known, False
-            _check_queue(session, new.owner, limit)
-            count_job(session, new.owner, quotas, now, sum(entry["size"] for entry in new.inputs))
-            values = new.row(now)
-            session.execute(sa.insert(_JOBS), values)
-            job = JobRow(**values)
-            if used_key is not None:
+                known = session.get(JobRow, used_key.created_id) if used_key.created_id else None
+                if known is not None:
+                    session.expunge(known)  # a rollback would expire it
+                    session.rollback()
+                    return known, False
                 used_key.created_id = job.id
-            digests = sorted({entry["sha256"] for entry in new.inputs})
-            uses = [{"holder": holder_name(job.id), "sha256": sha256} for sha256 in digests]
-            try:
-                session.execute(sa.insert(_BLOB_USES), uses)
-            except IntegrityError as error:
-                raise problems.NOT_FOUND("An input was deleted while it was being checked. Upload it again.") from error
+            _check_queue(session, new.owner, limit, own=1)
+            count_job(session, new.owner, quotas, now, sum(entry["size"] for entry in new.inputs))
+            digests = {entry["sha256"] for entry in new.inputs}
+            held = session.execute(_HOLD, {"holder": holder_name(job.id), "digests": list(digests)})
+            if held.rowcount < len(digests):  # type: ignore[attr-defined]
+                raise problems.NOT_FOUND("An input was deleted while it was being checked. Upload it again.")
             if receipt is not None:
                 close_receipt(session, receipt)
             check_bytes(session, new.owner, quotas)
-            add_status_event(session, job, now)
             count(session, "sgsst_jobs_submitted_total")
         return job, True
+
+    def shown_new(self, job: JobRow) -> ShownJob:
+        """Return a job that has just been created as users see it: queued, whatever has happened since."""
+        with self._database.reading_rows() as connection:
+            position = connection.execute(_POSITION_OF, {"job_id": job.id}).scalar() or 1
+        named = [entry for entry in job.inputs if entry["role"] in _NAMED_ROLES]
+        return ShownJob(job, named, Counter(entry["role"] for entry in job.inputs), position, None)
 
     def get(self, job_id: str, owner: str | None) -> JobRow:
         """Return a job without its inputs."""
@@ -421,11 +420,11 @@ class Jobs:
 
     def detail(self, job_id: str, owner: str | None) -> tuple[ShownJob, list[AttemptRow]]:
         """Return a job as it is shown, and its attempts, all in one snapshot."""
-        with self._database.reading_rows() as connection:
+        with self._database.reading_rows(one_snapshot=True) as connection:
             row = connection.execute(_JOB, {"job_id": job_id}).one_or_none()
             if row is None or (owner is not None and row.owner != owner):
                 raise problems.NO_JOB(job_id=job_id)
-            (shown,) = _shown(connection, [JobRow(**row._mapping)])
+            (shown,) = _shown(connection, [row])
             rows = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if shown.row.attempt else ()
             return shown, [AttemptRow(**each._mapping) for each in rows]
 
@@ -440,8 +439,8 @@ class Jobs:
             query = query.where(_JOBS.c.status.in_(status))
         if before is not None:
             query = query.where(_JOBS.c.id < before)
-        with self._database.reading_rows() as connection:
-            return _shown(connection, [JobRow(**row._mapping) for row in connection.execute(query)])
+        with self._database.reading_rows(one_snapshot=True) as connection:
+            return _shown(connection, connection.execute(query).all())
 
     def finish(self, job_id: str, owner: str | None) -> JobRow:
         """Make a running job end after its current step, with its present colors as the result.
@@ -666,29 +665,26 @@ class Jobs:
             session.execute(sa.update(JobRow).where(same).values(swept=True))
 
 
-def _check_queue(session: Session, owner: str, limit: int) -> None:
-    """Raise QUEUE_FULL if an owner has `limit` unfinished jobs."""
-    if session.execute(_UNFINISHED_OF, {"owner": owner}).scalar_one() >= limit:
+def _check_queue(session: Session, owner: str, limit: int, own: int = 0) -> None:
+    """Raise QUEUE_FULL if an owner has `limit` unfinished jobs besides `own` of this transaction."""
+    if session.execute(_UNFINISHED_OF, {"owner": owner}).scalar_one() - own >= limit:
         raise problems.QUEUE_FULL(limit=limit)
 
 
-def _shown(connection: sa.Connection, jobs: Sequence[JobRow]) -> list[ShownJob]:
-    """Return jobs as users see them, in the same snapshot."""
-    counts, inputs = _counts_and_named(connection, [job.id for job in jobs])
-    started = [job.id for job in jobs if job.attempt]
-    rows = connection.execute(_NEWEST_PREVIEWS, {"ids": started}) if started else ()
-    previews = {row.job_id: row.newest for row in rows}
+def _shown(connection: sa.Connection, rows: Sequence[Any]) -> list[ShownJob]:
+    """Return jobs as users see them, from rows of `_SHOWN_JOBS` that are of the connection's snapshot."""
+    counts = {row.id: Counter[str]() for row in rows}
+    named: dict[str, list[dict[str, Any]]] = {row.id: [] for row in rows}
+    if rows:  # PostgreSQL compares with no type in an empty list
+        query, parameters = _queries(connection.dialect.name)["shown"], {"ids": list(counts), "roles": _NAMED_ROLES}
+        for job_id, role, entry, number in connection.execute(query, parameters):
+            counts[job_id][role] += number
+            named[job_id] += [json.loads(entry)] * number if entry else []
+    names = [column.name for column in _COLUMNS]
     return [
-        ShownJob(job, inputs[job.id], counts[job.id], _queue_position(connection, job), previews.get(job.id))
-        for job in jobs
+        ShownJob(JobRow(**dict(zip(names, row, strict=False))), named[row.id], counts[row.id], *row[-2:])
+        for row in rows
     ]
-
-
-def _queue_position(connection: sa.Connection, job: JobRow) -> int | None:
-    if job.status != states.JobStatus.QUEUED:
-        return None
-    own = {"priority": job.priority, "queued_at": job.queued_at, "job_id": job.id}
-    return 1 + int(connection.execute(_AHEAD, own).scalar_one())
 
 
 @dataclass(frozen=True)
