@@ -6,8 +6,7 @@ import re
 from functools import cache
 from pathlib import Path
 
-from service.settings import installed_extras
-from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
+from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING, installed_extras
 from sgsst_core.files.formats import DOWNLOADS, FORMATS, RESULT_FORMATS
 from sgsst_core.settings import STRENGTHS
 

@@ -14,7 +14,6 @@ import sys
 import textwrap
 import time
 from functools import cached_property, lru_cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -214,26 +213,6 @@ def read_settings() -> ServiceSettings:
         name = ".".join(str(part) for part in first["loc"])
         value = "" if name in ("database", "artifacts") else f" = {first['input']!r}"  # URLs may hold passwords
         raise SettingsError(f"Environment variable SGSST_{name.upper()}{value}: {reason(first)}.") from error
-
-
-#: Module that each extra installs, and what it is for.
-_EXTRAS = {"video": ("av", "Videos"), "heif": ("pillow_heif", "HEIC images")}
-
-
-def installed_extras() -> dict[str, bool]:
-    """Return whether each optional extra is installed."""
-    return {extra: find_spec(module) is not None for extra, (module, _) in _EXTRAS.items()}
-
-
-def missing_extras() -> list[str]:
-    """Return a line for the operator about each feature that is not offered, with the command that installs it."""
-    missing = [extra for extra, there in installed_extras().items() if not there]
-    return [f"{_EXTRAS[each][1]} are not offered. To add them: {install_command(each)}" for each in missing]
-
-
-def install_command(extra: str) -> str:
-    """Return the command that installs an extra."""
-    return f"pip install 'sgsst-service[{extra}]'"
 
 
 def check_weights() -> None:

@@ -1,11 +1,13 @@
 """States of a job, and the table of all transitions between them, from which API, clients and page derive theirs.
 
-In addition, what the process of an attempt reports, because this module imports no database.
+In addition, what the process of an attempt reports, and which extras are installed, because this module imports
+neither a database nor settings: commands for scenes use it without the extra `service`.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib.util import find_spec
 from typing import Literal
 
 
@@ -152,3 +154,23 @@ def next_status(status: str, transition: Transition) -> JobStatus:
         KeyError: If the status does not allow the transition.
     """
     return TRANSITIONS[transition][JobStatus(status)]
+
+
+#: Module that each extra installs, and what it is for.
+_EXTRAS = {"video": ("av", "Videos"), "heif": ("pillow_heif", "HEIC images")}
+
+
+def installed_extras() -> dict[str, bool]:
+    """Return whether each optional extra is installed."""
+    return {extra: find_spec(module) is not None for extra, (module, _) in _EXTRAS.items()}
+
+
+def missing_extras() -> list[str]:
+    """Return a line for the operator about each feature that is not offered, with the command that installs it."""
+    missing = [extra for extra, there in installed_extras().items() if not there]
+    return [f"{_EXTRAS[each][1]} are not offered. To add them: {install_command(each)}" for each in missing]
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra."""
+    return f"pip install 'sgsst-service[{extra}]'"

@@ -156,6 +156,8 @@ save("library.ply", result)
     run([core / "python", "-c", code], tmp_path, OMP_NUM_THREADS="1")
     assert (tmp_path / "library.ply").read_bytes() == out.read_bytes()
     assert (tmp_path / "library.ply").read_bytes() != ply.read_bytes()
+    for arguments in ("check scene.ply --cameras cameras.json", "view scene.ply --out scene.html"):
+        run([core / "sgsst", *arguments.split()], tmp_path)
 
 
 @pytest.mark.parametrize("arguments", ["serve", "fsck", "keys list", "stylize --workers 2"])

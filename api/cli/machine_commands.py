@@ -145,7 +145,7 @@ def run_service(settings: ServiceSettings, announce: Callable[[str], None]) -> N
         SettingsError: If the address is in use, other machines can reach the service and no API key exists, or no
             feature network is installed.
     """
-    from service.settings import missing_extras
+    from service.states import missing_extras
 
     with _opened(settings) as store:
         if settings.keys_required and not any(key.revoked_at is None for key in store.keys.all()):

@@ -31,7 +31,7 @@ from scipy import ndimage, spatial  # noqa: F401  # before the first fork, for o
 from service import problems
 from service.inputs import RESULT, ROLES, JobParameters, Staged, WorkRequest, job_spec
 from service.inspection.sandbox import confine, installation
-from service.settings import install_command
+from service.states import install_command
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders, load_registries
 from sgsst_core.devices import seconds_left

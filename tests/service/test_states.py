@@ -5,13 +5,14 @@ from itertools import product
 
 import pytest
 
-from service.settings import installed_extras, missing_extras
 from service.states import (
     ACTIONS,
     FINISHED,
     JobStatus,
     Transition,
     allowed,
+    installed_extras,
+    missing_extras,
     next_status,
 )
 
