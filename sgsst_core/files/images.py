@@ -1,7 +1,7 @@
 """Readers and writers of images as float32 tensors [H, W, 3] of sRGB values in 0..1; photos and masks of cameras.
 
-Colors are converted to sRGB by ICC profiles, or by those that the chunks gAMA and cHRM of a PNG describe. Photos and
-masks are found by name, checked by their headers, and read as their pinhole cameras see them.
+Colors are converted to sRGB by ICC profiles. Photos and masks are found by name, checked by their headers, and read as
+their pinhole cameras see them.
 """
 
 import functools
@@ -9,10 +9,9 @@ import io
 import math
 import os
 import re
-import struct
 import unicodedata
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath, PurePosixPath
@@ -90,8 +89,8 @@ def load_image(
 ) -> Tensor:
     """Read an image in one of `FORMATS` or HEIC, or the first frame of an animated one.
 
-    Colors are converted to sRGB by the image's ICC profile, or a PNG's chunks gAMA and cHRM; images without them are
-    taken for sRGB. Palettes, gray, 16 bits and CMYK are converted to RGB.
+    Colors are converted to sRGB by the image's ICC profile; images without one are taken for sRGB. Palettes, gray, 16
+    bits and CMYK are converted to RGB.
 
     Args:
         background: sRGB color behind transparent parts, in 0..1; white by default.
@@ -274,11 +273,6 @@ def _heif_format(path: Path, head: bytes) -> tuple[str, ...]:
 def _profile_of(path: Path, image: Image.Image, warn: Callable[[str], None]) -> "ColorProfile | None":
     """Return the color profile of an image; None if it has none that changes colors."""
     data = image.info.get("icc_profile")
-    if not data and image.format == "PNG":
-        try:
-            data = png_profile(image.info)
-        except (ArithmeticError, ValueError):
-            warn(f"{path.name}: its colors are taken for sRGB, because its gAMA or cHRM chunk is broken")
     if not data:
         return None
     gray = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
@@ -352,16 +346,6 @@ _MODES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}
 _ROUNDING = 1
 #: Spacing of the 8-bit colors for which a profile is compared with sRGB.
 _PROBE_STEP = 15
-_D50 = np.array([0.9642, 1.0, 0.8249])
-#: Cone responses of the Bradford adaptation (ICC.1:2010, annex E).
-_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-#: Chromaticities xy of white, red, green and blue of sRGB, and its curve in the form of `_matrix_profile`.
-_REC_709 = (0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
-_SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
-#: Exponent that stands for sRGB with its primaries, as the specification of PNG recommends, and rounding.
-_SRGB_GAMMA, _GAMMA_ROUNDING, _PRIMARY_ROUNDING = 2.2, 0.02, 0.001
-#: Exponents of curves that are believed.
-_GAMMAS = (0.1, 10.0)
 
 
 class ColorProfile:
@@ -425,59 +409,6 @@ class ColorProfile:
             probe = Image.fromarray(np.stack(np.meshgrid(axis, axis, axis), axis=3).reshape(len(axis), -1, 3))
         change = np.asarray(self.to_srgb(probe), np.int16) - np.asarray(probe.convert("RGB"), np.int16)
         return int(np.abs(change).max()) > _ROUNDING
-
-
-def png_profile(info: Mapping[str | tuple[int, int], Any]) -> bytes:
-    """Return the ICC profile that the color chunks of a PNG state without one; empty for sRGB or none.
-
-    Args:
-        info: Pillow's `info` of the image.
-
-    Raises:
-        ArithmeticError, ValueError: If they state no color space.
-    """
-    if "srgb" in info or not {"gamma", "chromaticity"} & info.keys():
-        return b""
-    points: Sequence[float] = info.get("chromaticity", _REC_709)
-    curve: Sequence[float] = _SRGB_CURVE
-    if "gamma" in info:
-        gamma = 1 / info["gamma"]
-        is_srgb = abs(gamma - _SRGB_GAMMA) < _GAMMA_ROUNDING and np.allclose(points, _REC_709, 0, _PRIMARY_ROUNDING)
-        curve = _SRGB_CURVE if is_srgb else (gamma,)
-    return _matrix_profile(points, curve)
-
-
-def _matrix_profile(points: Sequence[float], curve: Sequence[float]) -> bytes:
-    """Return the profile of an RGB space (ICC.1:2010).
-
-    Args:
-        points: Chromaticities xy of white, red, green and blue.
-        curve: Exponent; or exponent, a, b, c and d of (a x + b)^exponent from d on and c x below.
-
-    Raises:
-        ArithmeticError, ValueError: If the values are those of no space.
-    """
-    white, *columns = (np.array([x / y, 1, (1 - x - y) / y]) for x, y in np.reshape(points, (4, 2)).tolist())
-    matrix = np.stack(columns, axis=1)
-    matrix *= np.linalg.solve(matrix, white)
-    adapted = np.linalg.solve(_BRADFORD, np.diag(_BRADFORD @ _D50 / (_BRADFORD @ white)) @ _BRADFORD @ matrix)
-    if not (np.abs(adapted) < 4).all() or np.max(points) > 2 or not _GAMMAS[0] < curve[0] < _GAMMAS[1]:
-        raise ArithmeticError
-
-    def numbers(values: Sequence[float] | NDArray[np.float64]) -> bytes:
-        return bytes(np.rint(65536 * np.asarray(values)).astype(">i4").data)
-
-    tags = {"wtpt": b"XYZ " + bytes(4) + numbers(_D50)}
-    for name, column in zip("rgb", adapted.T, strict=True):
-        tags[f"{name}XYZ"] = b"XYZ " + bytes(4) + numbers(column)
-        tags[f"{name}TRC"] = struct.pack(">4s4xH2x", b"para", 3 if len(curve) > 1 else 0) + numbers(curve)
-    table, body = struct.pack(">I", len(tags)), b""
-    for name, tag in tags.items():
-        table += struct.pack(">4sII", name.encode(), 132 + 12 * len(tags) + len(body), len(tag))
-        body += tag
-    size = 128 + len(table) + len(body)
-    head = struct.pack(">I4xI4s4s4s12x4s", size, 2 << 24, b"mntr", b"RGB ", b"XYZ ", b"acsp").ljust(68, b"\0")
-    return (head + numbers(_D50)).ljust(128, b"\0") + table + body
 
 
 def _without_float_conversions(data: bytes) -> bytes:

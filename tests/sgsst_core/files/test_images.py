@@ -3,7 +3,6 @@
 import io
 import os
 import shutil
-import struct
 import subprocess
 import warnings
 import zlib
@@ -384,50 +383,6 @@ def test_images_without_a_profile_or_in_srgb_are_bit_identical(tmp_path: Path, p
     image = load_image(saved_with_profile(tmp_path / "a.png", stored, profile))
     expected = torch.from_numpy(stored.reshape(24, 36, -1)).float() / 255
     assert torch.equal(image, expected.expand(24, 36, 3))
-
-
-def chrm(red: tuple, green: tuple, blue: tuple, white: tuple, _gamma: float) -> bytes:
-    return struct.pack(">8I", *(round(1e5 * value) for point in (white, red, green, blue) for value in point))
-
-
-ADOBE, SRGB_CHUNK = {b"cHRM": chrm(*ADOBE_RGB)}, {b"sRGB": b"\0"}
-LINEAR, ROUNDED = {b"gAMA": struct.pack(">I", 100_000)}, {b"gAMA": struct.pack(">I", 45455)}
-
-
-@pytest.mark.parametrize(
-    ("chunks", "profile", "same_as"),
-    [
-        (ADOBE | ROUNDED, b"", rgb_profile(*ADOBE_RGB)),
-        (ADOBE, b"", rgb_profile(*ADOBE_RGB[:4], 0.0)),
-        (LINEAR, b"", rgb_profile(*SRGB[:4], 1.0)),
-        (SRGB_CHUNK | LINEAR, rgb_profile(*PROPHOTO), rgb_profile(*PROPHOTO)),
-        (SRGB_CHUNK | LINEAR | ADOBE, b"", b""),
-        (ROUNDED, b"", b""),  # how many programs state sRGB
-        (ROUNDED | {b"cHRM": chrm(*SRGB)}, b"", b""),
-    ],
-)
-def test_color_chunks_of_a_png_count_by_their_precedence(
-    tmp_path: Path, chunks: dict[bytes, bytes], profile: bytes, same_as: bytes
-) -> None:
-    image = load_image(with_chunks(saved_with_profile(tmp_path / "a.png", colors(), profile), *chunks.items()))
-    expected = load_image(saved_with_profile(tmp_path / "b.png", colors(), same_as))
-    assert float((image - expected).abs().max()) <= (2.1 / 255 if same_as else 0)
-
-
-@pytest.mark.parametrize(
-    "chunks",
-    [
-        {b"gAMA": bytes(4)},
-        {b"gAMA": b"\0\0\0\1"},
-        {b"cHRM": bytes(32)},
-        {b"cHRM": struct.pack(">8I", *[33333] * 8)},
-        {b"cHRM": struct.pack(">8I", *range(2**32 - 8, 2**32))},
-    ],
-)
-def test_color_chunks_that_cannot_be_converted_give_a_warning(tmp_path: Path, chunks: dict[bytes, bytes]) -> None:
-    with pytest.warns(ImageWarning, match="taken for sRGB, because its gAMA or cHRM chunk is broken"):
-        image = load_image(with_chunks(saved_with_profile(tmp_path / "a.png", colors(), b""), *chunks.items()))
-    assert torch.equal(image, torch.from_numpy(colors()).float() / 255)
 
 
 def test_gray_of_8_and_16_bits_is_converted_equally(tmp_path: Path) -> None:
