@@ -50,7 +50,8 @@ WHITE: Color = (1.0, 1.0, 1.0)
 #: Formats whose further images are no frames, but previews or maps of the brightness.
 _STILL = ("JPEG", "MPO", "HEIF")
 _JPEG_QUALITY = 95
-#: Largest pixel of a float image whose white is 1. Resampling and sharpening overshoot.
+#: Largest pixel of a gray image with more than 8 bits, relative to white. Resampling and sharpening overshoot; in an
+#: image with larger values, white is the largest one.
 _OVERSHOOT = 2.0
 _EXIF_ORIENTATION = 0x0112
 #: What makes an image upright, by its EXIF orientation.
@@ -291,12 +292,12 @@ def _to_rgb(path: Path, image: Image.Image, profile: "ColorProfile | None", back
         values: NDArray[np.float32] = np.asarray(image, dtype=np.float32)
         if not np.isfinite(values).all():
             raise ImageError(f"{path}: holds NaN or infinite pixels. Use another image.")
-        gray = np.clip(values / np.float32(_full_scale(image.mode, float(values.max()))), 0, 1)
-        colors = profile.gray_to_srgb(gray) if profile else np.repeat(gray[:, :, None], 3, axis=2)
-        key = image.info.get("transparency")
-        if isinstance(key, int):
-            colors[values == key] = background
-        return colors
+        white = np.float32(1 if image.mode == "F" else 65535)
+        white = white if values.max() <= _OVERSHOOT * white else values.max()
+        gray = np.clip(values / white, 0, 1)
+        if profile is None:
+            return np.repeat(gray[:, :, None], 3, axis=2)
+        image = Image.fromarray(np.rint(255 * gray).astype(np.uint8))
     transparent = image.has_transparency_data
     if transparent:
         image = image.convert("RGBA")
@@ -309,20 +310,6 @@ def _to_rgb(path: Path, image: Image.Image, profile: "ColorProfile | None", back
         image = Image.alpha_composite(Image.new("RGBA", image.size, rgb), image)
     pixels: NDArray[np.float32] = np.divide(np.asarray(image.convert("RGB")), 255, dtype=np.float32)
     return pixels
-
-
-def _full_scale(mode: str, largest: float) -> float:
-    """Return the pixel value of white.
-
-    For float and 32-bit images, it is the smallest common maximum (1, 255 or 65535) that no pixel exceeds. Floats
-    up to 2 count as overshoot of an image whose white is 1.
-    """
-    if mode.startswith("I;16"):
-        return 65535.0
-    ranges = (255.0, 65535.0) if mode == "F" else (65535.0,)
-    if mode == "F" and largest <= _OVERSHOOT:
-        return 1.0
-    return next((full for full in ranges if largest <= full), largest)
 
 
 def _save(path: Path, image: Tensor, **options: Any) -> None:
@@ -389,16 +376,6 @@ class ColorProfile:
         converted = ImageCms.applyTransform(image.convert(self._mode), self._transform)
         assert converted is not None  # it is None only for conversions in place
         return converted
-
-    def gray_to_srgb(self, gray: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Convert gray values [H, W] in 0..1 to sRGB, [H, W, 3].
-
-        They are interpolated between the converted values of 8 bits, so that finer gradations remain.
-        """
-        steps = np.arange(256, dtype=np.uint8)
-        converted = np.asarray(self.to_srgb(Image.fromarray(steps[None])), np.float32)[0] / 255
-        channels = [np.interp(gray, steps / 255, channel) for channel in converted.T]
-        return np.stack(channels, axis=2).astype(np.float32)
 
     def _differs_from_srgb(self) -> bool:
         """Return whether the profile changes a grid of colors, by more than rounding."""
