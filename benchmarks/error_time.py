@@ -37,8 +37,7 @@ from sgsst_core.report.page import (
     png_chart,
     round_length,
     running_mean,
-    set_log_x,
-    set_log_y,
+    set_log,
 )
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.settings import PresetName
@@ -275,9 +274,7 @@ def _draw(axes: Axes, runs: Runs, key: str) -> None:
             axes.plot(x, y, clip_on=False, marker="osD^"[index], color=color_of(index), label=label)
         low, high = ([each(row[key] for row in rows) for rows in own] for each in (min, max))
         axes.vlines(x, low, high, color=color_of(index), linewidth=1)
-    every = [row for rows in runs.values() for row in rows]
-    set_log_x(axes, column([row["seconds"] for row in every]), "seconds from the command")
-    set_log_y(axes, [column([row[key] for row in every])])
+    set_log(axes, "seconds from the command")
 
 
 if __name__ == "__main__":

@@ -286,9 +286,10 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
     losses = len([panel for panel in titles if panel not in _JUDGED.values()])
     with page.png_chart(path, (5.2 * len(titles), 4.8)) as figure:
         every = figure.subplots(1, len(titles), squeeze=False)[0]
-        drawn = [_draw_curves(axes, shown, panel) for axes, panel in zip(every, titles, strict=True)]
-        for index, axes in enumerate(every):
-            page.set_log_y(axes, drawn[:losses] if index < losses else [drawn[index]])
+        for index, (axes, panel) in enumerate(zip(every, titles, strict=True)):
+            if 0 < index < losses:
+                axes.sharey(every[0])
+            _draw_curves(axes, shown, panel)
         front = pareto_front(shown)
         seconds, relative = [point.seconds for _, point, _ in front], [loss for *_, loss in front]
         every[0].plot(seconds, relative, "--", color=INK, lw=2.5, alpha=0.35)
@@ -304,24 +305,23 @@ def _measures(point: Point) -> dict[str, float | None]:
     return {_MEAN: point.relative, **scales, **judged}
 
 
-def _draw_curves(axes: "Axes", curves: Sequence[Curve], title: str) -> page.Floats:
-    """Draw a measure of points against seconds with one line per curve; return the drawn values."""
-    seconds = [page.column([point.seconds for point in curve.points]) for curve in curves]
-    values = [page.column([_measures(point).get(title) for point in curve.points]) for curve in curves]
+def _draw_curves(axes: "Axes", curves: Sequence[Curve], title: str) -> None:
+    """Draw a measure of points against seconds with one line per curve."""
     for index, curve in enumerate(curves):
-        axes.plot(
-            seconds[index],
-            values[index],
-            marker=_MARKERS[index % len(_MARKERS)],
-            markersize=4,
-            linewidth=1,
-            color=color_of(index),
-            label=curve.variant.name,
-            clip_on=False,
-        )
-    page.set_log_x(axes, page.joined(seconds), "seconds of optimization")
+        known = {point.seconds: value for point in curve.points if (value := _measures(point).get(title))}
+        if known:
+            axes.plot(
+                list(known.keys()),
+                list(known.values()),
+                marker=_MARKERS[index % len(_MARKERS)],
+                markersize=4,
+                linewidth=1,
+                color=color_of(index),
+                label=curve.variant.name,
+                clip_on=False,
+            )
+    page.set_log(axes, "seconds of optimization")
     axes.set_title(title)
-    return page.joined(values)
 
 
 @dataclass(frozen=True)

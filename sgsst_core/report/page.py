@@ -3,7 +3,6 @@
 import base64
 import io
 import math
-import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,9 +14,8 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from sgsst_core.files.atomic import atomic_path
@@ -264,11 +262,6 @@ TABLES: dict[str, Callable[[dict[str, Any]], Table | None]] = {
 
 
 Floats = NDArray[np.float64]
-#: Range of values on logarithmic axes. matplotlib searches for ticks some decades beyond it, which must fit float64
-#: too.
-_MIN, _MAX = 1e-200, 1e200
-#: Factor by which the x axis extends beyond the first and the last step.
-X_MARGIN = 1.05
 #: Style of all charts, for `matplotlib.rc_context`.
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
@@ -318,26 +311,6 @@ def column(values: Sequence[float | None]) -> Floats:
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 
-def joined(columns: Sequence[Floats]) -> Floats:
-    """Concatenate columns; the list may be empty."""
-    return np.concatenate([np.empty(0), *columns])
-
-
-def _drawable(values: Floats) -> NDArray[np.bool_]:
-    """Return the mask [n] bool of the values that a logarithmic axis can show."""
-    return np.isfinite(values) & (values >= _MIN) & (values <= _MAX)
-
-
-def log_limits(values: Floats, margin: float) -> tuple[float, float]:
-    """Return the limits of a logarithmic axis that shows the values; arbitrary limits if there is nothing to show."""
-    shown = values[_drawable(values)]
-    if not len(shown):
-        return 0.1, 1.0
-    low, high = float(shown.min()), float(shown.max())
-    margin = 2.0 if high < 1.0001 * low else margin
-    return low / margin, high * margin
-
-
 def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
     """Return the geometric mean of the last `window` values at each index, or of all values so far if there are fewer.
 
@@ -365,7 +338,7 @@ def _draw_loss(figure: Figure, report: dict[str, Any]) -> None:
         lines.append(("mean", column(several), INK))
     coarse = [record["seconds"] for record in records if record["stage"] == "coarse"]
     for label, values, color in lines:
-        shown = _drawable(seconds) & _drawable(values)
+        shown = (seconds > 0) & (values > 0) & np.isfinite(values)
         if not shown.any():
             continue
         x, y = seconds[shown], values[shown]
@@ -375,8 +348,7 @@ def _draw_loss(figure: Figure, report: dict[str, Any]) -> None:
         axes.plot(x, means, color=color, label=label, marker="o" if len(x) == 1 else None)
     if 0 < len(coarse) < len(records):
         axes.axvline(coarse[-1], color=INK, linewidth=0.8, linestyle=":")
-    set_log_x(axes, seconds, "seconds")
-    set_log_y(axes, [values for _, values, _ in lines])
+    set_log(axes, "seconds")
     axes.set_ylabel(RELATIVE_LOSS)
     draw_legend(figure)
 
@@ -415,31 +387,13 @@ def scale_name(scale: int) -> str:
     return f"scale {scale} (1/{1 << scale})" if scale else "scale 0 (full size)"
 
 
-def set_log_x(axes: Axes, values: Floats, label: str) -> None:
-    """Make the x axis logarithmic, with limits that include the values [n]."""
-    limits = log_limits(values, X_MARGIN)
-    axes.set(xscale="log", xlim=limits, xlabel=label)
-    _set_ticks(axes.xaxis, limits)
-
-
-def set_log_y(axes: Axes, drawn: Sequence[Floats]) -> None:
-    """Make the y axis logarithmic, with limits that include all drawn arrays [n]."""
-    limits = log_limits(joined(drawn), 1.2)
-    axes.set(yscale="log", ylim=limits)
-    _set_ticks(axes.yaxis, limits)
-
-
-def _set_ticks(axis: Axis, limits: tuple[float, float]) -> None:
-    """Set ticks with plain numbers: at decades, also at 2 and 5 if decades are few, and linearly within one decade."""
-    decades = math.log10(limits[1]) - math.log10(limits[0])
-    axis.set_minor_locator(NullLocator())
-    if decades < 0.8:
-        axis.set_major_locator(MaxNLocator(4))
-    else:
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if decades < 2.2 else (1,), numticks=8))
-        axis.set_minor_locator(LogLocator(subs="auto", numticks=8))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")))
-    axis.set_minor_formatter(NullFormatter())
+def set_log(axes: Axes, label: str) -> None:
+    """Make both axes logarithmic, with plain numbers at 1, 2 and 5 times the powers of ten, and label the x axis."""
+    axes.set(xscale="log", yscale="log", xlabel=label)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
 
 
 def draw_legend(figure: Figure, in_row: int = 3) -> None:
