@@ -71,20 +71,12 @@ def replace(temporary: Path, final: Path) -> None:
             temporary.replace(final)
             return
         except PermissionError as error:
-            problem = error
-        if time.monotonic() > deadline:
-            break
+            if time.monotonic() > deadline:
+                raise HeldOpenError(
+                    f"{final}: cannot be replaced: {error.strerror}. Another program may have it open. Nothing is "
+                    f"lost: the new file is {temporary}; rename it."
+                ) from error
         time.sleep(0.1)
-    new = final.with_name(f"{final.stem}.new{final.suffix}")
-    try:
-        os.link(temporary, new)  # unlike a rename, it never replaces a file
-        temporary.unlink()
-    except OSError:
-        new = temporary
-    raise HeldOpenError(
-        f"{final}: cannot be replaced: {problem.strerror}. Another program may have it open. Nothing is lost: the new "
-        f"file is {new}."
-    ) from problem
 
 
 def file_digest(path: Path) -> str:
