@@ -241,8 +241,6 @@ GAUSSIANS_PER_BYTE = 16
 _PIXELS_PER_GAUSSIAN, _MORE_PIXELS = 2, 1 << 16
 #: Bytes that a lossless image may take beyond 4 per pixel.
 _IMAGE_OVERHEAD = 1 << 16
-#: Largest width and height of a WebP image.
-_MAX_SIDE = 16383
 
 #: Palette vectors in a row of their image, and maximum number of vectors.
 _PALETTE_COLUMNS = 64
@@ -584,8 +582,6 @@ def recolored(files: SogFiles, header: SogHeader, change: NDArray[np.float32]) -
 def _write(output: BinaryIO, arrays: scene_format.Arrays, rendering: Rendering) -> None:
     """Write a SOG archive. Gaussians are sorted along a space-filling curve, which compresses better."""
     count, coefficients = arrays["sh_rest"].shape[:2]
-    if count > _MAX_SIDE**2:
-        raise OutputError(f"SOG cannot hold {count} Gaussians. Write a PLY, or a .compressed.ply.")
     steps, bounds = _encoded_positions(arrays["means"])
     # the order of what is written, so that a scene from a SOG file stays in order
     order = scene_format.along_curve(steps.astype(np.float32))
