@@ -20,13 +20,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.advice import refuse_camera_json
-from sgsst_core.files.camera_folder import (
-    FORMATS,
-    ColmapCamera,
-    find_cameras,
-    load_json,
-    read_model,
-)
+from sgsst_core.files.camera_folder import FORMATS, ColmapCamera, find_cameras, load_json, read_model
 from sgsst_core.files.images import PhotoFolder, image_size
 from sgsst_core.scene.camera import COEFFICIENTS, FORMULAS, Camera, Lens, cube_faces
 from sgsst_core.scene.gaussians import exact_rotation
