@@ -90,8 +90,8 @@ def load_image(
 ) -> Tensor:
     """Read an image in one of `FORMATS` or HEIC, or the first frame of an animated one.
 
-    Colors are converted to sRGB by the image's ICC profile; images without one are taken for sRGB. Palettes, gray, 16
-    bits and CMYK are converted to RGB.
+    Colors are converted to sRGB by the image's ICC profile; images without one are taken for sRGB, with a warning if
+    the chunks of a PNG state another space. Palettes, gray, 16 bits and CMYK are converted to RGB.
 
     Args:
         background: sRGB color behind transparent parts, in 0..1; white by default.
@@ -275,6 +275,11 @@ def _profile_of(path: Path, image: Image.Image, warn: Callable[[str], None]) -> 
     """Return the color profile of an image; None if it has none that changes colors."""
     data = image.info.get("icc_profile")
     if not data:
+        stated = (image.info.get("gamma", _SRGB_CHUNKS[0]), *image.info.get("chromaticity", _SRGB_CHUNKS[1:]))
+        if "srgb" not in image.info and not np.allclose(stated, _SRGB_CHUNKS, 0, _CHUNK_ROUNDING):
+            warn(
+                f"{path.name}: its colors are taken for sRGB, although its chunks state another space: save it as sRGB"
+            )
         return None
     gray = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
     mode = "L" if gray else "CMYK" if image.mode == "CMYK" else "RGB"
@@ -331,6 +336,8 @@ MAX_PROFILE_BYTES = 4 << 20
 _MODES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}
 #: Maximum change of 8-bit values by a profile that counts as sRGB. Published sRGB profiles differ in the last digits.
 _ROUNDING = 1
+#: What the chunks gAMA and cHRM of a PNG state for sRGB: the exponent, then xy of white, red, green and blue.
+_SRGB_CHUNKS, _CHUNK_ROUNDING = (0.45455, 0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06), 0.005
 #: Spacing of the 8-bit colors for which a profile is compared with sRGB.
 _PROBE_STEP = 15
 

@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
 from sgsst_core.files.atomic import atomic_path
@@ -388,10 +388,13 @@ def scale_name(scale: int) -> str:
 
 
 def set_log(axes: Axes, label: str) -> None:
-    """Make both axes logarithmic, with plain numbers at 1, 2 and 5 times the powers of ten, and label the x axis."""
+    """Make both axes logarithmic, once all is drawn, with plain numbers at round values, and label the x axis."""
     axes.set(xscale="log", yscale="log", xlabel=label)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(
+            MaxNLocator(4) if high < 6 * low else LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,))
+        )
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter("")
 

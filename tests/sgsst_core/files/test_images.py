@@ -3,6 +3,7 @@
 import io
 import os
 import shutil
+import struct
 import subprocess
 import warnings
 import zlib
@@ -376,6 +377,27 @@ def test_images_without_a_profile_or_in_srgb_are_bit_identical(tmp_path: Path, p
     image = load_image(saved_with_profile(tmp_path / "a.png", stored, profile))
     expected = torch.from_numpy(stored.reshape(24, 36, -1)).float() / 255
     assert torch.equal(image, expected.expand(24, 36, 3))
+
+
+@pytest.mark.parametrize(
+    ("chunks", "warned"),
+    [
+        ({b"gAMA": struct.pack(">I", 45455)}, False),  # how many programs state sRGB
+        ({b"gAMA": struct.pack(">I", 100_000)}, True),
+        ({b"gAMA": struct.pack(">I", 100_000), b"sRGB": b"\0"}, False),
+        ({b"cHRM": struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)}, False),
+        ({b"cHRM": struct.pack(">8I", 31270, 32900, 64000, 33000, 21000, 71000, 15000, 6000)}, True),
+        ({b"cHRM": bytes(32)}, True),
+    ],
+)
+def test_color_chunks_of_a_png_give_a_warning_unless_they_state_srgb(
+    tmp_path: Path, chunks: dict[bytes, bytes], warned: bool
+) -> None:
+    notes: list[str] = []
+    path = with_chunks(saved_with_profile(tmp_path / "a.png", colors(), b""), *chunks.items())
+    image = load_image(path, warn=notes.append)
+    assert torch.equal(image, torch.from_numpy(colors()).float() / 255)
+    assert ["state another space" in note for note in notes] == [True] * warned
 
 
 def test_gray_of_8_and_16_bits_is_converted_equally(tmp_path: Path) -> None:
