@@ -17,7 +17,7 @@ rm cp313/_wmi.pyd # Wine 8 ends the process in it; `platform` works without it
 python3 -m venv uv && uv/bin/pip install --quiet uv
 SSL_CERT_FILE=${PIP_CERT:-} uv/bin/uv pip install --quiet --target site --only-binary :all: \
     --python-platform x86_64-pc-windows-msvc --python-version 3.13 --constraints "$source/constraints.txt" \
-    --requirements "$source/pyproject.toml"
+    --requirements "$source/pyproject.toml" --extra mcp
 
 wineboot --init
 # Extensions written in Rust load bcryptprimitives.dll, which Wine 8 lacks. Its one function has an older name in another
