@@ -337,16 +337,15 @@ def checked(response: httpx2.Response) -> httpx2.Response:
 
     Raises:
         RequestError: If the service refused the request as faulty.
-        ApiError: If the service failed, or another program answered.
+        ApiError: If the service failed, or another program redirects.
     """
-    if response.status_code < 400:
-        _check_origin(response)
+    if response.is_success:
         return response
     try:
         problem = response.json()
         message = str(problem["detail"])
     except (ValueError, KeyError, TypeError):
-        problem, message = {}, f"{response.request.url} answered {response.status_code}"
+        problem, message = {}, _strangeness(response)
     raise refusal(message, response.status_code, problem)
 
 
@@ -359,35 +358,25 @@ def parsed(response: httpx2.Response) -> Any:
     """Return the JSON of a response.
 
     Raises:
-        ApiError: If the response is not JSON.
+        ApiError: If the response is not JSON, so that another program has sent it.
     """
     try:
         return response.json()
     except ValueError as error:
-        raise _foreign(response, "it sends no JSON") from error
+        raise ApiError(_strangeness(response), response.status_code) from error
 
 
-def _check_origin(response: httpx2.Response) -> None:
-    """Raise an ApiError if a successful response is not the service's, whose responses are JSON or empty."""
-    kind = response.headers.get("content-type", "no type")
-    if response.has_redirect_location:
-        what = f"it redirects to {response.headers['location']}"
-    elif response.content and not kind.startswith("application/json"):
-        what = f"it sends {kind}"
-    else:
-        return
-    raise _foreign(response, what)
-
-
-def _foreign(response: httpx2.Response, what: str) -> ApiError:
-    """Return the error for a response that another program has sent."""
-    url = response.request.url
-    return ApiError(f"{url} does not answer like the service: {what}. Check the address.", response.status_code)
+def _strangeness(response: httpx2.Response) -> str:
+    """Return what distinguishes a response from those of the service."""
+    location, kind = response.headers.get("location"), response.headers.get("content-type", "no JSON")
+    what = f"redirects to {location}" if location else f"sends {kind}"
+    url, status = response.request.url, response.status_code
+    return f"{url} answers {status} and {what}, which the service does not. Check the address."
 
 
 def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
     """Return the error for a refused request: RequestError if the request is at fault, ApiError if the service is."""
-    return (RequestError if status < 500 else ApiError)(message, status, problem)
+    return (RequestError if 400 <= status < 500 else ApiError)(message, status, problem)
 
 
 def is_temporary(error: Exception) -> bool:

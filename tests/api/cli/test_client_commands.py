@@ -348,12 +348,13 @@ def answer_as_a_stranger(handler: BaseHTTPRequestHandler) -> None:
 def test_address_of_another_program_is_reported(sgsst: Sgsst) -> None:
     with LocalServer(answer_as_a_stranger) as server:
         for path, what in (
-            ("", "it sends text/html"),
-            ("/moved", "it redirects to https://new.example/"),
-            ("/empty", "it sends no JSON"),
+            ("", "200 and sends text/html"),
+            ("/moved", "301 and redirects to https://new.example/"),
+            ("/empty", "200 and sends no JSON"),
         ):
             for command in (["status", MISSING], ["jobs"], ["download", MISSING], ["watch", MISSING]):
-                assert f"does not answer like the service: {what}. Check the address." in sgsst(
+                assert f" answers {what}, which the service does not. Check the address." in sgsst(
                     [*command, "--url", server.origin + path], 1
                 )
+        assert "redirects to https://new.example/" in sgsst(["delete", MISSING, "--url", f"{server.origin}/moved"], 1)
         server.shutdown()
