@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import urllib.request
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +20,8 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 #: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
 TRIES = 6
 
-#: Variables of the environment that name proxies, hosts to reach without them, and files for encrypted connections.
-_ENVIRONMENT = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY", "SSL_CERT_FILE", "SSLKEYLOGFILE")
+#: Variables of the environment that name proxies and hosts to reach without them, and files for encrypted connections.
+_PROXIES, _FILES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY"), ("SSL_CERT_FILE", "SSLKEYLOGFILE")
 #: Methods of requests that change nothing.
 _READS = ("GET", "HEAD")
 
@@ -164,11 +163,10 @@ class Transport:
 
     def unreachable(self, error: Exception) -> "ApiError":
         """Return the error for a service that did not respond."""
-        proxy = _proxy_for(self.url)
-        named = proxy and httpx2.URL(proxy).copy_with(userinfo=b"")
-        through = f" through the proxy {named} (NO_PROXY excludes hosts)" if proxy else ""
+        names = _given(_PROXIES)
+        advice = f"; {names} decides on a proxy" if names else ""
         return ApiError(
-            f"{self.url} cannot be reached{through}: {error}. Is `sgsst serve` running? --url names another address."
+            f"{self.url} cannot be reached: {error}. Is `sgsst serve` running? --url names another address{advice}."
         )
 
     async def _retry(self, once: Callable[[], Awaitable[T]], *, reading: bool = False) -> T:
@@ -241,22 +239,16 @@ def _http_client(url: str, headers: dict[str, str]) -> httpx2.AsyncClient:
         RequestError: If one of these cannot be used.
     """
     try:
-        proxy = _proxy_for(url)
-        if proxy.startswith("http") and not _is_address(proxy):
-            raise ValueError("the proxy has no address that is possible")
         return httpx2.AsyncClient(base_url=url, headers=headers, timeout=httpx2.Timeout(30.0, read=900.0, write=120.0))
     except Exception as error:  # httpx2 raises errors of many types here, some of them built-in
-        given = " or ".join(name for name in sorted(os.environ) if name.upper() in _ENVIRONMENT and os.environ[name])
-        raise RequestError(f"{given} cannot be used: {str(error).rstrip('.')}. Correct or unset it.") from error
+        raise RequestError(
+            f"{_given(_PROXIES + _FILES)} cannot be used: {str(error).rstrip('.')}. Correct or unset it."
+        ) from error
 
 
-def _proxy_for(url: str) -> str:
-    """Return the address of the proxy that the environment names for a URL; empty for none."""
-    parsed, proxies = httpx2.URL(url), urllib.request.getproxies()
-    proxy = proxies.get(parsed.scheme) or proxies.get("all")
-    if not proxy or urllib.request.proxy_bypass(parsed.host):
-        return ""
-    return proxy if "://" in proxy else f"http://{proxy}"
+def _given(variables: tuple[str, ...]) -> str:
+    """Return the names of those variables that are set, as a text."""
+    return " or ".join(name for name in sorted(os.environ) if name.upper() in variables and os.environ[name])
 
 
 def json_text(value: object) -> str:
