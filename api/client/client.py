@@ -190,13 +190,46 @@ class AsyncClient:
                 {name: Path(path) for name, path in (masks or {}).items()},
                 [Path(path) for path in painted or ()],
             )
-            fields = await _sent(self._transport, inputs, progress)
-        return [*fields, ("parameters", (None, given))]
+            total = sum(file.size for file in inputs if file.size > PART_BYTES)
+            done = 0
+            fields: list[tuple[str, Any]] = [("parameters", (None, given))]
+            for file in inputs:
+                if isinstance(file.source, str):
+                    fields.append((file.role, (None, file.source)))
+                elif file.size > PART_BYTES:
+                    report = partial(lambda before, now, _size: progress(before + now, total), done)
+                    fields.append((file.role, (None, await self.upload(file.source, file.name, report))))
+                    done += file.size
+                else:
+                    content = await in_thread(file.source.read_bytes)
+                    fields.append((file.role, (file.name, content, "application/octet-stream")))
+        return fields
 
     async def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> str:
         """Upload a file in parts, and return the upload's id. Any number of jobs may use the upload."""
         path = Path(path)
-        return await _upload(self._transport, path, name or path.name, progress)
+        size = (await in_thread(path.stat)).st_size
+        creation = {
+            **_TUS,
+            "Upload-Length": str(size),
+            "Upload-Metadata": f"filename {base64.b64encode((name or path.name).encode()).decode()}",
+            "Idempotency-Key": secrets.token_hex(16),
+        }
+        created = await self._transport.json("POST", "/v1/uploads", headers=creation)
+        where = f"/v1/uploads/{created['id']}"
+        offset = int(created["offset"])
+        while offset < size:
+            part, headers = await in_thread(_read_part, path, offset)
+            try:
+                await self._transport.call("PATCH", where, content=part, headers=headers)
+                offset += len(part)
+            except ApiError as error:
+                if error.status != 409:
+                    raise
+                state = await self._transport.call("HEAD", where, headers=_TUS)
+                offset = int(state.headers["Upload-Offset"])
+            progress(offset, size)
+        return str(created["id"])
 
     async def job(self, job_id: str) -> Job:
         """Return the current state of a job."""
@@ -256,8 +289,8 @@ class AsyncClient:
         artifacts: list[dict[str, Any]] = []
         cursor: str | None = ""
         while cursor is not None:
-            query = f"?cursor={quote(cursor, safe='')}" if cursor else ""
-            page = await self._transport.json("GET", f"{_job_path(job_id)}/artifacts{query}")
+            query = {"cursor": cursor} if cursor else {}
+            page = await self._transport.json("GET", f"{_job_path(job_id)}/artifacts", params=query)
             artifacts += page["artifacts"]
             cursor = page.get("next_cursor")  # services of earlier versions send all at once
         return artifacts
@@ -473,31 +506,6 @@ PART_BYTES = 16 << 20
 _TUS = {"Tus-Resumable": "1.0.0"}
 
 
-async def _upload(transport: Transport, path: Path, name: str, progress: Progress) -> str:
-    """Upload a file in parts, and return the upload's id."""
-    size = (await in_thread(path.stat)).st_size
-    creation = {
-        **_TUS,
-        "Upload-Length": str(size),
-        "Upload-Metadata": f"filename {base64.b64encode(name.encode()).decode()}",
-        "Idempotency-Key": secrets.token_hex(16),
-    }
-    created = await transport.json("POST", "/v1/uploads", headers=creation)
-    where = f"/v1/uploads/{created['id']}"
-    offset = int(created["offset"])
-    while offset < size:
-        part, headers = await in_thread(_read_part, path, offset)
-        try:
-            await transport.call("PATCH", where, content=part, headers=headers)
-            offset += len(part)
-        except ApiError as error:
-            if error.status != 409:
-                raise
-            offset = int((await transport.call("HEAD", where, headers=_TUS)).headers["Upload-Offset"])
-        progress(offset, size)
-    return str(created["id"])
-
-
 def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
     """Return a part of a file, and the headers to send it with."""
     with path.open("rb") as file:
@@ -522,25 +530,6 @@ def _packed(scene: Path | str, folder: Path) -> Path | str:
     archive = folder / f"{index.absolute().parent.name or 'scene'}.zip"
     pack(index, archive)
     return archive
-
-
-async def _sent(transport: Transport, inputs: Sequence[InputFile], progress: Progress) -> list[tuple[str, Any]]:
-    """Upload the large files, and return the form fields of all."""
-    total = sum(file.size for file in inputs if file.size > PART_BYTES)
-    done = 0
-    fields: list[tuple[str, Any]] = []
-    for file in inputs:
-        if isinstance(file.source, str):
-            fields.append((file.role, (None, file.source)))
-        elif file.size > PART_BYTES:
-            report = partial(lambda before, now, _size: progress(before + now, total), done)
-            upload_id = await _upload(transport, file.source, file.name, report)
-            fields.append((file.role, (None, upload_id)))
-            done += file.size
-        else:
-            content = await in_thread(file.source.read_bytes)
-            fields.append((file.role, (file.name, content, "application/octet-stream")))
-    return fields
 
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".avif", ".heic", ".heif", ".hif")
@@ -614,10 +603,8 @@ def camera_files(path: Path) -> list[Path]:
     It accepts the same paths as `sgsst stylize --cameras`.
 
     Raises:
-        RequestError: If the path does not exist.
         CameraError: If there are none.
     """
-    _check_exists(path)
     cameras = find_cameras(path)
     if cameras.is_dir():
         suffix = ".bin" if (cameras / "cameras.bin").is_file() else ".txt"
@@ -627,19 +614,12 @@ def camera_files(path: Path) -> list[Path]:
     return [cameras, companion] if companion.is_file() and companion != cameras else [cameras]
 
 
-def _check_exists(path: Path) -> None:
-    """Raise a RequestError if there is neither a file nor a folder."""
-    if not path.exists():
-        raise RequestError(f"{path}: does not exist. Check the path.")
-
-
 def image_files(folder: Path) -> list[tuple[Path, str]]:
     """Return all images below a folder, with their paths relative to it.
 
     Raises:
         RequestError: If there are none.
     """
-    _check_exists(folder)
     visible = (path for path in folder.rglob("*") if not path.name.startswith("."))
     images = sorted(path for path in visible if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
     if not images:
