@@ -18,7 +18,6 @@ from api.cli.options import (
     SubmittedArguments,
     cameras_of,
     file_to_write,
-    path_to_write,
     with_arguments,
     with_options,
 )
@@ -179,7 +178,6 @@ def download(
         Path | None,
         typer.Option(
             help="File to write, whose ending is the format of stylized.ply, or folder for 'all'. [default: NAME]",
-            callback=path_to_write,
         ),
     ] = None,
     overwrite: Annotated[

@@ -4,8 +4,8 @@ import errno
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,23 +38,10 @@ class Invocation:
 
     Attributes:
         started: Start of the process, or of the call of `main` in another program, in seconds since the epoch.
-        missing: Paths to write and their folders, inner ones first, that did not exist when their options were read.
     """
 
     arguments: list[str]
     started: float
-    missing: list[Path] = field(default_factory=list)
-
-    def expect(self, output: Path) -> None:
-        """Note what is missing of the path of a file or a folder that the command will write."""
-        final = Path(os.path.realpath(output))
-        self.missing.extend(path for path in (final, *final.parents) if not path.exists())
-
-    def remove_empty_folders(self) -> None:
-        """Remove the folders that the command has created and left empty."""
-        for path in self.missing:
-            with suppress(OSError):  # never created, a file, or not empty
-                path.rmdir()
 
 
 class PlainConsole(Console):

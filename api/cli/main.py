@@ -154,25 +154,13 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, and return its exit code. A command that fails leaves no empty folders for its outputs."""
+    """Run the command line, and return its exit code. Expected errors become one message on stderr, no traceback."""
     started = process_start() if arguments is None else time.time()
-    invocation = Invocation(sys.argv[1:] if arguments is None else list(arguments), started)
-    code = FAILURE
-    try:
-        code = _run(invocation)
-    finally:
-        if code:
-            invocation.remove_empty_folders()
-    return code
-
-
-def _run(invocation: Invocation) -> int:
-    """Run a command. Expected errors become one message on stderr and an exit code, without a traceback."""
-    arguments = invocation.arguments
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":  # file names hold any characters
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        code = app(args=arguments, prog_name="sgsst", obj=invocation, standalone_mode=False)
+        code = app(args=arguments, prog_name="sgsst", obj=Invocation(arguments, started), standalone_mode=False)
         return code if isinstance(code, int) else 0
     except _UsageError as error:
         error.message = error.message.removeprefix("Value error, ")  # typer validates by pydantic

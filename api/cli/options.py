@@ -187,10 +187,9 @@ def local_path(text: str) -> Path:
 def _checking(check: Callable[[Path], None]) -> Callable[..., Path | None]:
     """Return the callback of an option that names a path to write; the message of an error names the option."""
 
-    def checked(context: typer.Context, parameter: typer.CallbackParam, path: Path | None) -> Path | None:
+    def checked(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
         try:
             if path is not None:
-                context.obj.expect(path)
                 check(path)
         except OutputError as error:
             raise OutputError(f"{parameter.metavar or parameter.opts[0]}: {error}") from error
@@ -199,9 +198,8 @@ def _checking(check: Callable[[Path], None]) -> Callable[..., Path | None]:
     return checked
 
 
-#: Callbacks that check the file or the folder that an option names, before the command reads anything; the last one is
-#: for a path that the command itself checks.
-file_to_write, folder_to_write, path_to_write = map(_checking, (check_file, check_folder, lambda path: None))
+#: Callbacks that check the file or the folder that an option names, before the command reads anything.
+file_to_write, folder_to_write = _checking(check_file), _checking(check_folder)
 
 
 def path_to_read(help: str, **how: Any) -> Any:

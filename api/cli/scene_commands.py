@@ -23,7 +23,6 @@ from api.cli.options import (
     file_to_write,
     folder_to_write,
     path_to_read,
-    path_to_write,
     source_of,
     with_arguments,
     with_options,
@@ -119,7 +118,6 @@ def render(
         typer.Option(
             help="Video to write instead: a .mp4 file (H.264), a .webm file (VP9), a folder or a pattern such as "
             "frame_%04d.png for PNG images.",
-            callback=path_to_write,
             rich_help_panel=ESSENTIALS,
         ),
     ] = None,

@@ -222,7 +222,7 @@ def test_share_prints_the_link(files: list[str], sgsst: Sgsst, service: Service)
     assert "days" in sgsst(["share", job_id, "--days", "91"], 2)
 
 
-def test_download_to_a_full_disk_leaves_nothing(
+def test_download_to_a_full_disk_leaves_no_file(
     files: list[str], sgsst: Sgsst, service: Service, tmp_path: Path
 ) -> None:
     job_id = submit(files, sgsst)
@@ -230,7 +230,7 @@ def test_download_to_a_full_disk_leaves_nothing(
     out = tmp_path / "new" / "out.ply"
     with full_disk(100_000):
         assert f"error: {out}: cannot be written: File too large." in sgsst(["download", job_id, "--out", str(out)], 2)
-    assert not out.parent.exists()
+    assert list(out.parent.iterdir()) == []
 
 
 @pytest.mark.parametrize("job_id", ["", "?", ".", "..", "a/b", "a b#c"])
