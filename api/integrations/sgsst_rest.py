@@ -8,6 +8,7 @@ import http.client
 import json
 import os
 import secrets
+import tempfile
 import threading
 import time
 import urllib.error
@@ -220,13 +221,17 @@ def description(job: dict[str, Any]) -> str:
 
 
 class BackgroundJob(threading.Thread):
-    """Job that runs while a program stays usable. The program reads the attributes from its own thread.
+    """Job that paints a splat while a program stays usable. The program reads the attributes from its own thread.
 
     Args:
-        files: Scene, style image, and the PLY to write.
+        columns: The splat, as for `write_splat`.
         live: Whether to download the colors while they are being painted.
 
+    Raises:
+        ValueError: If there is no style image.
+
     Attributes:
+        out: PLY with the result, in a folder that is deleted with the job.
         fraction: Completed fraction of the steps.
         text: State as a line.
         colors: Newest `live/colors.f16`; None before the first, and without `live`.
@@ -234,21 +239,27 @@ class BackgroundJob(threading.Thread):
         canceled: Event to set in order to cancel the job.
     """
 
-    def __init__(self, service: Service, files: tuple[Path, Path, Path], *, live: bool = False, **options: Any) -> None:
+    def __init__(
+        self, service: Service, columns: Mapping[str, Any], style: Path, *, live: bool = False, **options: Any
+    ) -> None:
         super().__init__(daemon=True)
+        if not style.is_file():
+            raise ValueError(f"There is no painting {str(style)!r}. Choose an image file.")
+        self._folder = tempfile.TemporaryDirectory()
+        self._scene, self.out = (Path(self._folder.name) / name for name in ("splat.ply", "stylized.ply"))
+        write_splat(self._scene, columns)
         self.fraction = 0.0
         self.text = "uploading"
         self.colors: bytes | None = None
         self.error: str | None = None
         self.canceled = threading.Event()
-        self._service, self._files, self._live, self._options = service, files, live, options
+        self._service, self._style, self._live, self._options = service, style, live, options
         self._etag = ""
 
     def run(self) -> None:
         """Submit the job, follow it, and download its result."""
-        scene, style, out = self._files
         try:
-            job_id = self._service.submit(scene, style, **self._options)
+            job_id = self._service.submit(self._scene, self._style, **self._options)
             for job in self._service.watch(job_id):
                 if self.canceled.is_set():
                     self._service.cancel(job_id)
@@ -257,7 +268,7 @@ class BackgroundJob(threading.Thread):
                 self.fraction, self.text = fraction(job), description(job)
                 if self._live and job["status"] == "running":
                     self._fetch_colors(job_id)
-            self._service.download(job_id, "stylized.ply", out)
+            self._service.download(job_id, "stylized.ply", self.out)
         except (ServiceError, OSError) as error:
             self.error = str(error)
 

@@ -6,7 +6,6 @@ are standard deviations, and opacities are 0 to 1.
 """
 # No postponed annotations: Blender reads the properties of its classes from them.
 
-import tempfile
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,7 +14,7 @@ import bpy
 import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from .sgsst_rest import COLORS, REQUIRED, BackgroundJob, Service, orbit_options, read_colors, write_splat
+from .sgsst_rest import COLORS, REQUIRED, BackgroundJob, Service, orbit_options, read_colors
 
 #: Factor of the first spherical harmonic.
 _SH_C0 = 0.28209479177387814
@@ -111,21 +110,14 @@ class Current:
 
     job: BackgroundJob | None = None
     source_name = ""
-    folder: tempfile.TemporaryDirectory[str] | None = None
     message = ""
 
 
 def start(source: Any, settings: Any, service: Service) -> None:
     """Send an object's splat; raises like `splat_columns`, and ValueError without a style image."""
-    style = Path(bpy.path.abspath(settings.style))
-    if not style.is_file():
-        raise ValueError(f"There is no style image {settings.style!r}. Choose an image file.")
-    columns = splat_columns(source.data)
-    Current.folder = tempfile.TemporaryDirectory()
-    scene, out = (Path(Current.folder.name) / name for name in ("splat.ply", "stylized.ply"))
-    write_splat(scene, columns)
     options = orbit_options(settings.preset, settings.views, settings.up, settings.minutes)
-    Current.job = BackgroundJob(service, (scene, style, out), **options)
+    style = Path(bpy.path.abspath(settings.style))
+    Current.job = BackgroundJob(service, splat_columns(source.data), style, **options)
     Current.source_name, Current.message = source.name, ""
     Current.job.start()
     bpy.app.timers.register(follow, first_interval=0.5, persistent=True)
@@ -137,17 +129,15 @@ def follow() -> float | None:
         for area in window.screen.areas:
             area.tag_redraw()
     assert Current.job is not None
-    assert Current.folder is not None
     if Current.job.is_alive():
         return 0.5
-    error, Current.job = Current.job.error, None  # whatever follows, another job can be started
+    job, Current.job = Current.job, None  # whatever follows, another job can be started
     source = bpy.data.objects.get(Current.source_name)
-    with Current.folder as folder:
-        if error or source is None:
-            Current.message = error or f"The object {Current.source_name} is gone. Its result was not added."
-        else:
-            shown = show_result(source, Path(folder) / "stylized.ply", bpy.context.scene.sgsst.result)
-            Current.message = f"Painted {shown.name}."
+    if job.error or source is None:
+        Current.message = job.error or f"The object {Current.source_name} is gone. Its result was not added."
+    else:
+        shown = show_result(source, job.out, bpy.context.scene.sgsst.result)
+        Current.message = f"Painted {shown.name}."
     return None
 
 

@@ -3,7 +3,6 @@
 Its panel: choose a painting, watch the colors in the open scene, compare and undo.
 """
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 import lichtfeld as lf
 
-from .sgsst_rest import BackgroundJob, Service, orbit_options, read_colors, write_splat
+from .sgsst_rest import BackgroundJob, Service, orbit_options, read_colors
 
 _PRESETS = ["preview", "standard", "paper"]
 _UP = ["auto", "-y", "y", "-z", "z", "-x", "x"]
@@ -61,13 +60,9 @@ class Running:
     """Job that paints a splat."""
 
     def __init__(self, name: str, style: Path, service: Service, options: dict[str, Any]) -> None:
-        splat = splat_of(name)
-        self._folder = tempfile.TemporaryDirectory()
-        scene, self.out = (Path(self._folder.name) / file for file in ("splat.ply", "stylized.ply"))
-        columns = splat_columns(splat)
-        write_splat(scene, columns)
+        columns = splat_columns(splat_of(name))
         self.painting = Painting(name, np.stack([columns[f"f_dc_{i}"] for i in range(3)], axis=1))
-        self.job = BackgroundJob(service, (scene, style, self.out), live=True, **options)
+        self.job = BackgroundJob(service, columns, style, live=True, **options)
         self._shown: bytes | None = None
         self.job.start()
 
@@ -85,8 +80,7 @@ class Running:
                 painting.painted = np.frombuffer(colors, "<f2").reshape(-1, 3).astype(np.float32)
                 painting.show()
             return True
-        result = None if job.error else read_colors(self.out)
-        self._folder.cleanup()
+        result = None if job.error else read_colors(job.out)
         if result is None or len(result) != len(painting.original):
             painting.show(painting.original)
             raise ValueError(job.error or "The result has fewer Gaussians: delete those without size or color first.")
@@ -167,11 +161,8 @@ class SgsstPanel(lf.ui.Panel):
             self._painting = SgsstPanel.running.painting
 
     def _start(self) -> Running:
-        style = Path(self._style)
-        if not style.is_file():
-            raise ValueError(f"There is no painting {self._style!r}. Choose an image file.")
         options = orbit_options(_PRESETS[self._preset], self._views, _UP[self._up], self._minutes)
-        return Running(lf.get_selected_node_name(), style, Service(self._service), options)
+        return Running(lf.get_selected_node_name(), Path(self._style), Service(self._service), options)
 
     def _draw_progress(self, ui: Any, running: Running) -> None:
         ui.progress_bar(running.job.fraction, running.job.text)

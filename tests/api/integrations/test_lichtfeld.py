@@ -102,7 +102,7 @@ def test_colors_appear_while_they_are_being_painted(
 
         colors, error = None, "The job was canceled."
 
-        def __init__(self, service: Any, files: Any, *, live: bool, **options: Any) -> None:
+        def __init__(self, service: Any, columns: Any, style: Path, *, live: bool, **options: Any) -> None:
             super().__init__(target=started.wait, daemon=True)
             assert live
 

@@ -1,16 +1,28 @@
 """Tests of the client that all packages contain."""
 
 import hashlib
+import tempfile
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from api.integrations import sgsst_rest
 from tests.api.conftest import KEYED, Services
 from tests.api.service import Service
 from tests.http_servers import LocalServer, send
+from tests.small_scenes import wall
+
+
+def splat() -> dict[str, Any]:
+    """Return a wall as arrays by the property of a PLY."""
+    scene = wall()
+    tensors = (scene.means, scene.sh_dc, scene.opacities[:, None], scene.scales, scene.quats)
+    values = np.concatenate([each.numpy() for each in tensors], axis=1)
+    return dict(zip(("x", "y", "z", *sgsst_rest.REQUIRED), values.T, strict=True))
 
 
 def answer_oddly(handler: BaseHTTPRequestHandler) -> None:
@@ -77,13 +89,26 @@ def test_each_failure_says_what_to_do(odd: sgsst_rest.Service, services: Service
 )
 def test_job_that_cannot_be_submitted_has_an_error(length: str, advice: str, tmp_path: Path) -> None:
     """Programs that show a job in the background take one without an error for a success."""
-    scene, style = (tmp_path / name for name in ("scene.ply", "style.png"))
-    scene.write_bytes(b"ply")
+    style = tmp_path / "style.png"
+    style.write_bytes(b"image")
     with LocalServer(lambda handler: send(handler, b"<html>", Content_Length=length)) as server:
-        job = sgsst_rest.BackgroundJob(sgsst_rest.Service(server.origin), (scene, style, tmp_path / "out.ply"))
+        job = sgsst_rest.BackgroundJob(sgsst_rest.Service(server.origin), splat(), style)
         job.run()
     assert job.error is not None
     assert job.error.startswith((advice, f"{server.origin} {advice}"))
+
+
+def test_files_of_a_job_end_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(ValueError, match=r"There is no painting .*none\.png'\. Choose an image file\."):
+        sgsst_rest.BackgroundJob(sgsst_rest.Service(), splat(), tmp_path / "none.png")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "style.png").write_bytes(b"image")
+    job = sgsst_rest.BackgroundJob(sgsst_rest.Service(), splat(), tmp_path / "style.png")
+    assert [path.name for path in job.out.parent.iterdir()] == ["splat.ply"]
+    with pytest.warns(ResourceWarning):
+        del job
+    assert [path.name for path in tmp_path.iterdir()] == ["style.png"]
 
 
 @pytest.mark.slow
@@ -96,8 +121,8 @@ def test_stylize_returns_the_service_s_result(
     assert out.read_bytes() == client.request("GET", f"/v1/jobs/{job_id}/artifacts/stylized.ply").read()
     with pytest.raises(sgsst_rest.ServiceError, match="Both 'cameras'"):
         client.stylize(scene, style, tmp_path / "b.ply", [cameras], orbit=3)
-    job = sgsst_rest.BackgroundJob(client, (scene, style, tmp_path / "c.ply"), live=True, orbit=4, preset="preview")
+    job = sgsst_rest.BackgroundJob(client, splat(), style, live=True, orbit=4, preset="preview", up="-y")
     job.run()
     assert (job.error, job.fraction) == (None, 1)
     assert job.colors is None or len(job.colors) == 6 * 28 * 22
-    assert (tmp_path / "c.ply").exists()
+    assert sgsst_rest.read_colors(job.out).shape == (28 * 22, 3)
