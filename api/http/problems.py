@@ -7,7 +7,6 @@ bodies are defined with their models (`api.http.schemas`, `api.http.submission`,
 import errno
 import json
 import logging
-import re
 from collections.abc import Callable, Iterator, Sequence
 from http import HTTPStatus
 from typing import Any, TypeVar
@@ -79,18 +78,14 @@ class Problem(BaseModel):
     detail: str = Field(description="What was wrong and what to do, for people.")
 
 
-def _response(status: int, code: str, detail: str, headers: dict[str, str], **extra: object) -> JSONResponse:
-    title = _TITLES.get(status) or HTTPStatus(status).phrase
-    body = Problem(title=title, status=status, code=code, detail=detail, **extra)
-    return JSONResponse(body.model_dump(mode="json"), status, headers, media_type=MEDIA_TYPE)
-
-
 def from_service(error: ServiceError) -> JSONResponse:
     """Return the problem document of a service error."""
     headers = dict(error.headers)
     if error.retry_after is not None:
         headers["Retry-After"] = str(error.retry_after)
-    return _response(error.status, error.code, str(error), headers, **error.extra)
+    title = _TITLES.get(error.status) or HTTPStatus(error.status).phrase
+    body = Problem(title=title, status=error.status, code=error.code, detail=str(error), **error.extra)
+    return JSONResponse(body.model_dump(mode="json"), error.status, headers, media_type=MEDIA_TYPE)
 
 
 async def _expected(request: Request, error: ServiceError | InvalidInputError) -> JSONResponse:
@@ -116,16 +111,14 @@ async def _invalid_request(request: Request, error: RequestValidationError | Val
     return from_service(problems.INVALID_REQUEST(f"{first['at'] or 'body'}: {first['message']}", errors=errors))
 
 
-async def _http_error(request: Request, error: HTTPException) -> JSONResponse:
+async def _not_routed(request: Request, error: HTTPException) -> JSONResponse:
     path = request.scope["path"][:_SHOWN]
     if error.status_code == 404:
         return from_service(problems.NOT_FOUND(f"There is nothing at {path!r}. {address('/docs')} lists all paths."))
-    if error.status_code == 405:  # the router's own header lists only the methods of the first route
-        routed = routed_methods(request.scope)
-        allowed = [method for method in METHODS if method in routed or (method == "HEAD" and "GET" in routed)]
-        method = request.method[:_SHOWN]
-        return from_service(problems.METHOD_NOT_ALLOWED(path=path, method=method, allowed=", ".join(allowed)))
-    return _response(error.status_code, "http-error", str(error.detail), dict(error.headers or {}))
+    routed = routed_methods(request.scope)  # the router's own header lists only those of the first route
+    allowed = [method for method in METHODS if method in routed or (method == "HEAD" and "GET" in routed)]
+    method = request.method[:_SHOWN]
+    return from_service(problems.METHOD_NOT_ALLOWED(path=path, method=method, allowed=", ".join(allowed)))
 
 
 def routed_methods(scope: Scope) -> list[str]:
@@ -157,7 +150,7 @@ HANDLERS: dict[Any, Any] = {
     InvalidInputError: _expected,
     RequestValidationError: _invalid_request,
     ValidationError: _invalid_request,
-    HTTPException: _http_error,
+    HTTPException: _not_routed,
     OSError: _system_error,
     Exception: _unexpected,
 }
@@ -375,8 +368,7 @@ _OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
 }
 
 #: Problems that dependencies of routes raise, and models of the JSON bodies that they read.
-_RAISED: dict[Callable[..., Any], tuple[ProblemType, ...]] = {}
-_BODIES: dict[Callable[..., Any], type[BaseModel]] = {}
+_RAISED: dict[Callable[..., Any], tuple[tuple[ProblemType, ...], type[BaseModel] | None]] = {}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -389,9 +381,7 @@ def raises(*raised: ProblemType, body: type[BaseModel] | None = None) -> Callabl
     """
 
     def record(function: Function) -> Function:
-        _RAISED[function] = raised
-        if body is not None:
-            _BODIES[function] = body
+        _RAISED[function] = raised, body
         return function
 
     return record
@@ -409,8 +399,9 @@ def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any
     """Add the JSON body and the problems of a route to its operation, with an example for each code."""
     raised: list[ProblemType | ServiceError] = list(_ANYWHERE)
     for function in _dependencies(route.dependant):
-        raised += _RAISED.get(function, ())
-        if model := _BODIES.get(function):
+        problems_of_it, model = _RAISED.get(function, ((), None))
+        raised += problems_of_it
+        if model:
             _add_schema(schemas, model)
             body = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
             operation["requestBody"] = {"required": True, "content": {"application/json": body}}
@@ -440,7 +431,8 @@ def _is_limited(parameter: dict[str, Any]) -> bool:
     """Return whether there are values that a parameter may not have."""
     schema = parameter["schema"]
     known = schema.keys() | schema.get("anyOf", [{}])[0].keys()
-    return "const" not in known and not known.isdisjoint(("le", "lt", "pattern", "maxLength", "enum"))
+    limited = not known.isdisjoint(("le", "lt", "pattern", "maxLength", "enum"))
+    return limited and parameter["name"] != "Tus-Resumable"  # which has a problem of its own
 
 
 def links(*operations: str, **parameters: str) -> dict[str, Any]:
@@ -452,7 +444,7 @@ def complete(document: dict[str, Any], routes: Sequence[BaseRoute], models: Sequ
     """Complete FastAPI's OpenAPI document in place.
 
     FastAPI omits models that no route takes as an argument, drops nulls from examples, and has its own error schemas.
-    Generators of clients do not support constants in headers, and use the first media type of a response.
+    Generators of clients use the first media type of a response.
     """
     schemas = document["components"]["schemas"]
     for model in models:
@@ -466,9 +458,7 @@ def complete(document: dict[str, Any], routes: Sequence[BaseRoute], models: Sequ
                 # The header is required. It has a default only because tus requires status 412, not 422, without it.
                 if parameter["name"] == "Tus-Resumable":
                     parameter["required"] = True
-                    version = parameter["schema"].pop("const")
-                    parameter["schema"].pop("default", None)
-                    parameter["schema"]["pattern"] = f"^{re.escape(version)}$"
+                    del parameter["schema"]["default"]
             for answer in operation["responses"].values():
                 if "application/json" in answer.get("content", {}):
                     answer["content"] = {"application/json": None, **answer["content"]}
