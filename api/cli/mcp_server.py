@@ -227,10 +227,6 @@ async def serve(root: Path, url: str | None, key: str | None) -> None:
     )
     async with AsyncClient(url, key) as client:
         tools = Tools(client, root)
-        server.add_tool(tools.estimate, annotations=_READS)
-        server.add_tool(tools.submit, annotations=_CREATES)
-        server.add_tool(tools.status, annotations=_READS)
-        server.add_tool(tools.result, annotations=_CREATES)
-        server.add_tool(tools.blend, annotations=_CREATES)
-        server.add_tool(tools.share, annotations=_CREATES)
+        for tool in (tools.estimate, tools.submit, tools.status, tools.result, tools.blend, tools.share):
+            server.add_tool(tool, annotations=_READS if tool in (tools.estimate, tools.status) else _CREATES)
         await server.run_stdio_async()

@@ -77,10 +77,6 @@ class Metrics(Collector):
         """Return all metrics in the Prometheus text format."""
         return generate_latest(self._registry)
 
-    def describe(self) -> Iterable[Metric]:
-        """Return nothing: the names are not checked against those of others."""
-        return []
-
     def collect(self) -> Iterable[Metric]:
         """Yield the metrics of the database and the disk."""
         operations = self._store.operations
