@@ -7,7 +7,7 @@ The functions check all inputs, compute, and write the outputs, but print nothin
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import machine, plan_json
 from sgsst_core.report.images import write_views
 from sgsst_core.scene.camera import Camera, faces_to_render, join_faces, level, resized
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.style import STARRY_NIGHT
 from worker.derived import blend
@@ -147,17 +148,25 @@ def render_views(
         InvalidInputError: If scene, cameras or folder cannot be used.
     """
     file, capture = read_scene_and_capture(source)
-    scene, cameras = file.scene, capture.cameras
-    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near, memory=0)
-    check_something_seen(scene, cameras, rasterizer)
+    cameras = capture.cameras
+    images = _renders(file.scene, cameras, background, source.near)
     for line in warnings_of(capture.decisions):
         warn(line)
     ensure_writable_folder(out)
     paths = [out / name for name in view_file_names(cameras)]
-    for index, (camera, path) in enumerate(zip(cameras, paths, strict=True)):
-        save_png(path, rasterizer.render(scene_colors(scene, camera), camera))
+    for index, (image, path) in enumerate(zip(images, paths, strict=True)):
+        save_png(path, image)
         progress(index + 1, len(cameras))
     return paths
+
+
+def _renders(
+    scene: Scene, cameras: Sequence[Camera], background: tuple[float, float, float], near: float
+) -> Iterator[Tensor]:
+    """Return an iterator of the image [H, W, 3] of a scene at each camera, after checking that something is seen."""
+    rasterizer = make_rasterizer("cpu", scene, background=background, near=near, memory=0)
+    check_something_seen(scene, cameras, rasterizer)
+    return (rasterizer.render(scene_colors(scene, camera), camera) for camera in cameras)
 
 
 #: Width in pixels of a panorama, unless the request has a resolution.
@@ -187,20 +196,18 @@ def render_panorama(
     """
     check_suffix(out, "a PNG image", "panorama.png")
     file, capture = read_scene_and_capture(source)
-    scene, cameras = file.scene, capture.cameras
+    cameras = capture.cameras
     camera = cameras[0] if name is None else camera_named(cameras, name)
     ups = torch.stack([-each.world_to_camera[1, :3] for each in cameras])
     requested = orbit_request(source).up
     up = ups.mean(dim=0) if requested is None else torch.tensor(requested, dtype=torch.float64)
     width = max(2, (source.resolution or PANORAMA_WIDTH) // 2 * 2)
     faces = faces_to_render(level(camera, up), width)
-    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near, memory=0)
-    check_something_seen(scene, faces, rasterizer)
+    renders, images = _renders(file.scene, faces, background, source.near), list[Tensor]()
     for line in warnings_of(capture.decisions):
         warn(line)
-    images = []
-    for face in faces:
-        images.append(rasterizer.render(scene_colors(scene, face), face))
+    for image in renders:
+        images.append(image)
         progress(len(images), len(faces))
     out.parent.mkdir(parents=True, exist_ok=True)
     save_png(out, join_faces(images, width))
@@ -404,7 +411,7 @@ def make_study(
     cameras = [resized(camera, min(side, camera.side)) for camera in read_scene_and_capture(sources[0])[1].cameras]
 
     def render(index: int) -> list[Tensor]:
-        return _render(sources[index], cameras, background)
+        return list(_renders(read_scene_and_capture(sources[index])[0].scene, cameras, background, source.near))
 
     page.parent.mkdir(parents=True, exist_ok=True)
     write_study(page, key_path(page), [name for name, _ in scenes], image, len(cameras), render)
@@ -414,14 +421,6 @@ def named(text: str) -> tuple[str, Path]:
     """Return the name and the path of a variant, given as NAME=FILE, or as FILE, which is its own name."""
     name, equals, path = text.partition("=")
     return (name, local_path(path)) if equals and not Path(text).exists() else (text, local_path(text))
-
-
-def _render(source: SceneRequest, cameras: Sequence[Camera], background: tuple[float, float, float]) -> list[Tensor]:
-    """Return the image [H, W, 3] of a scene at each camera."""
-    scene = read_scene_and_capture(source)[0].scene
-    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near, memory=0)
-    check_something_seen(scene, cameras, rasterizer)
-    return [rasterizer.render(scene_colors(scene, camera), camera) for camera in cameras]
 
 
 def share_table(shares: Sequence[VoteShare]) -> Table:
