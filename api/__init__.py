@@ -2,10 +2,7 @@
 
 
 def installed_version() -> str:
-    """Return the version of the installed program; "0" if it is not installed."""
-    from importlib.metadata import PackageNotFoundError, version
+    """Return the version of the installed program."""
+    from importlib.metadata import version
 
-    try:
-        return version("sgsst-service")
-    except PackageNotFoundError:
-        return "0"
+    return version("sgsst-service")

@@ -174,7 +174,7 @@ def test_core_commands_name_the_missing_extra(core: Path, tmp_path: Path, argume
 
 
 def test_migrations_create_the_database(installed: Path, tmp_path: Path) -> None:
-    arguments = ["--data", str(tmp_path / "data"), "--json"]
-    run([installed / "sgsst", "keys", "create", "alice", *arguments], tmp_path)
-    listed = json.loads(run([installed / "sgsst", "keys", "list", *arguments], tmp_path))
+    data = ["--data", str(tmp_path / "data")]
+    run([installed / "sgsst", "keys", "create", "alice", *data], tmp_path)
+    listed = json.loads(run([installed / "sgsst", "keys", "list", *data, "--json"], tmp_path))
     assert [key["name"] for key in listed] == ["alice"]

@@ -122,8 +122,6 @@ def _styles_masks_and_parameters(
         values["style_weights"] = [file.weight for file in styles]
     images = [path_or_url(split_weight(text)[0]) for text in inputs.style]
     regions = inputs.regions
-    if urls := [text for region in regions for text in region.style_texts if isinstance(path_or_url(text), str)]:
-        raise SettingsError(f"--region-style {urls[0]}: cannot be a URL. Download the image, and give its path.")
     of_regions = [file.path for region in region_requests(regions) for file in region.styles]
     masks: dict[str, Path] = {}
     if regions:
@@ -280,8 +278,12 @@ def jobs(
 
 
 def usage(
-    since: Annotated[str | None, typer.Option(metavar="DAY", help="First day (UTC). [default: 30 days]")] = None,
-    until: Annotated[str | None, typer.Option(metavar="DAY", help="Last day. [default: today]")] = None,
+    since: Annotated[
+        datetime | None, typer.Option(metavar="DAY", help="First day (UTC). [default: 30 days]", formats=["%Y-%m-%d"])
+    ] = None,
+    until: Annotated[
+        datetime | None, typer.Option(metavar="DAY", help="Last day. [default: today]", formats=["%Y-%m-%d"])
+    ] = None,
     data: Annotated[
         Path | None, typer.Option(help="Read the database of this data folder, instead of asking a service.")
     ] = None,
@@ -295,13 +297,14 @@ def usage(
     """
     if data is not None and (url or key):
         raise SettingsError("--data reads a database, --url and --key ask a service. Omit --data, or the others.")
+    first, last = (None if day is None else day.date() for day in (since, until))
     if data is None:
         with open_client(url, key) as client:
-            rows = client.usage(since, until)
+            rows = client.usage(first and first.isoformat(), last and last.isoformat())
     else:
         from api.cli.machine_commands import usage_of_all
 
-        rows = usage_of_all(data, since, until)
+        rows = usage_of_all(data, first, last)
     if as_json:
         console.out_console.print(json.dumps(rows))
         return
@@ -394,12 +397,6 @@ def _print_job(job: Job, as_json: bool) -> None:
     console.out_console.print(json.dumps(job.data) if as_json else _job_text(job))
 
 
-def _progress_text(job: Job) -> str:
-    if job.status == "queued" and job.data.get("queue_position"):
-        return f"position {job.data['queue_position']} in the queue"
-    return Progress.model_validate(job.progress).text() if job.progress and not job.finished else ""
-
-
 def _short_status(job: Job) -> str:
     """Return the status of a job with its position in the queue or its progress."""
     if job.status == "queued" and job.data.get("queue_position"):
@@ -410,9 +407,9 @@ def _short_status(job: Job) -> str:
 
 
 def _job_text(job: Job) -> str:
-    lines = [f"{'job:':<12}{job.id}", f"{'name:':<12}{job.data['name']}", f"{'status:':<12}{job.status}"]
-    if _progress_text(job):
-        lines.append(f"{'progress:':<12}{_progress_text(job)}")
+    lines = [f"{'job:':<12}{job.id}", f"{'name:':<12}{job.data['name']}", f"{'status:':<12}{_short_status(job)}"]
+    if job.progress and not job.finished:
+        lines.append(f"{'progress:':<12}{Progress.model_validate(job.progress).text()}")
     result = job.data.get("result")
     if result:
         lines.append(f"{'steps:':<12}{_step_count_text(result)}")

@@ -295,7 +295,6 @@ def create_key(
     ] = None,
     operator: Annotated[bool, typer.Option("--operator", help="Let the key see the usage of all keys.")] = False,
     data: DataOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Create an API key and print it. Only a digest is stored, so the key cannot be shown again."""
     from service.store.keys import Quotas
@@ -303,9 +302,6 @@ def create_key(
     quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
     with _opened(_service_settings(data)) as store:
         row, text = store.keys.create(name, priority, quotas, operator=operator)
-    if as_json:
-        out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
-        return
     error_console.print(f"Key {row.id} of {row.name!r}. Save it now; it cannot be shown again:")
     out_console.print(text)
 
@@ -343,18 +339,14 @@ def revoke_key(
     error_console.print(f"Revoked key {row.id} of {row.name!r}.")
 
 
-def usage_of_all(data: Path, since: str | None, until: str | None) -> list[dict[str, Any]]:
+def usage_of_all(data: Path, since: date | None, until: date | None) -> list[dict[str, Any]]:
     """Return the usage of all keys in a service's data folder, as `GET /v1/usage` does.
 
     Raises:
-        SettingsError: If there is no database, or a text is no day.
+        SettingsError: If there is no database.
     """
-    try:
-        first, last = (None if day is None else date.fromisoformat(day) for day in (since, until))
-    except ValueError as error:
-        raise SettingsError(f"--since, --until: {error}. Give a day such as 2026-11-21.") from error
     with _opened(_service_settings(data), existing=True) as store:
-        rows = store.keys.usage(first, last, None)
+        rows = store.keys.usage(since, until, None)
     return [row | {"day": row["day"].isoformat()} for row in rows]
 
 

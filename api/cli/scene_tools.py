@@ -6,6 +6,7 @@ The functions check all inputs, compute, and write the outputs, but print nothin
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -93,11 +94,8 @@ def make_plan(
         check_is_not_input(out, source.cameras, "camera file")
     if sheet is not None:
         check_suffix(sheet, "a JPEG file", "views.jpg")
-        folders = [each.selection.path for each in request.regions if each.selection and each.selection.kind == "masks"]
-        images = [path for folder in (*folders, request.images) if folder for path in folder.rglob("*")]
-        images += [each.path for styles in (request.styles, *(r.styles for r in request.regions)) for each in styles]
-        for path in images:
-            check_is_not_input(sheet, path, "image of a style, mask or photo")
+        for style in itertools.chain(request.styles, *(region.styles for region in request.regions)):
+            check_is_not_input(sheet, style.path, "style image")
     inputs = read_inputs(request)
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)

@@ -107,7 +107,7 @@ def test_usage_of_own_key_and_of_all_keys(
             owner: {"day": rows[-1]["day"], **row} for owner, row in used.items()
         }.items()
         assert next(iter(used)) in sgsst(["usage", *command])
-        assert "2026-11-21" in sgsst(["usage", "--since", "monday", *command], 2)
+        assert "'monday' does not match the formats '%Y-%m-%d'" in sgsst(["usage", "--since", "monday", *command], 2)
     period = ["--since", "2026-01-01", "--until", "2026-11-30"]
     error = json.loads(sgsst(["usage", "--data", str(service.data), *period, "--json"], 2))
     assert (error["code"], "334 days" in error["detail"]) == ("invalid-request", True)

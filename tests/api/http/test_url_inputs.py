@@ -438,7 +438,7 @@ def test_submit_command_accepts_urls(service: Service, urls: dict[str, str], tmp
     names = {role: [entry["name"] for entry in job["inputs"] if entry["role"] == role] for role in urls}
     styles = ["style.png", "local.png", "2_local.png"]
     assert names == {"scene": ["scene.ply"], "cameras": ["cameras.json"], "style": styles}
-    assert "cannot be a URL. Download the image" in sgsst([*command, "--region-style", f"half={urls['style']}"], 2)
+    assert "not a file. Check the path." in sgsst([*command, "--region-style", f"half={urls['style']}"], 2)
     assert "not among the hosts" in sgsst(
         ["submit", "http://evil.test/scene.ply", "--style", str(style), "--orbit=3", "--url", service.url], 2
     )
