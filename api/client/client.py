@@ -39,7 +39,6 @@ from api.client.transport import (
     checked,
     has_events,
     in_thread,
-    is_temporary,
     json_text,
 )
 from service.states import Transition
@@ -271,7 +270,7 @@ class AsyncClient:
             except (httpx2.RequestError, ApiError) as error:
                 # stamina cannot do this: each event resets the count of failures
                 failures += 1
-                if failures >= TRIES or not is_temporary(error) or self._transport.gives_up(error):
+                if failures >= TRIES or not self._transport.may_pass(error):
                     raise (error if isinstance(error, ApiError) else self._transport.unreachable(error)) from None
                 await anyio.sleep(FIRST_WAIT * 2.0 ** (failures - 1))
                 continue

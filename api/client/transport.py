@@ -13,7 +13,7 @@ import httpx2
 import stamina
 
 from service.states import ENDED
-from sgsst_core.errors import InvalidInputError, OutputError, SgsstError
+from sgsst_core.errors import InvalidInputError, SgsstError
 from sgsst_core.files.atomic import disk_errors, file_digest, replace, temporary_path
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -22,8 +22,6 @@ TRIES = 6
 
 #: Variables of the environment that name proxies and hosts to reach without them, and files for encrypted connections.
 _PROXIES, _FILES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY"), ("SSL_CERT_FILE", "SSLKEYLOGFILE")
-#: Methods of requests that change nothing.
-_READS = ("GET", "HEAD")
 
 #: Callback that receives the number of completed and of all bytes, or steps.
 Progress = Callable[[int, int], None]
@@ -85,7 +83,7 @@ class Transport:
             self.reached = True
             return checked(response)
 
-        return await self._retry(once, reading=method in _READS)
+        return await self._retry(once)
 
     async def json(self, method: str, path: str, **options: Any) -> Any:
         """Send a request, and return the JSON of its response.
@@ -132,7 +130,7 @@ class Transport:
 
         Raises:
             RequestError, ApiError: As for `call`, or if the response does not state the SHA-256, or has another one.
-            OutputError: If the disk is full, and nothing of the file remains; or another program holds the target open.
+            OutputError: If the disk is full, or another program holds the target open.
         """
 
         async def once() -> None:
@@ -155,11 +153,16 @@ class Transport:
                         progress(done, size)
             await in_thread(_finish_file, path, target, digest)
 
-        await self._retry(once, reading=True)
+        await self._retry(once)
 
-    def gives_up(self, error: Exception) -> bool:
-        """Return whether a read error means that there is no service, rather than that it is restarting."""
-        return isinstance(error, httpx2.ConnectError) and not self.reached
+    def may_pass(self, error: Exception) -> bool:
+        """Return whether the same request may succeed later: there was no response, or it reports a temporary failure.
+
+        If the very first connection is refused, there is no service that could be restarting.
+        """
+        if isinstance(error, httpx2.ConnectError):
+            return self.reached
+        return isinstance(error, httpx2.RequestError) or getattr(error, "status", 0) in _TEMPORARY
 
     def unreachable(self, error: Exception) -> "ApiError":
         """Return the error for a service that did not respond."""
@@ -169,12 +172,9 @@ class Transport:
             f"{self.url} cannot be reached: {error}. Is `sgsst serve` running? --url names another address{advice}."
         )
 
-    async def _retry(self, once: Callable[[], Awaitable[T]], *, reading: bool = False) -> T:
-        def may_pass(error: Exception) -> bool:
-            return is_temporary(error) and not (reading and self.gives_up(error))
-
+    async def _retry(self, once: Callable[[], Awaitable[T]]) -> T:
         try:
-            return await self._retrying(may_pass, once)
+            return await self._retrying(self.may_pass, once)
         except httpx2.RequestError as error:
             raise self.unreachable(error) from None
 
@@ -203,14 +203,9 @@ def _start_file(target: Path, old: str, response: httpx2.Response) -> str:
 
 
 def _append(target: Path, digest: str, block: bytes) -> None:
-    """Append a block to a partial file, which is deleted if the disk is full."""
-    part = temporary_path(target, digest)
-    try:
-        with disk_errors(target), part.open("ab") as file:
-            file.write(block)
-    except OutputError:
-        part.unlink()
-        raise
+    """Append a block to a partial file."""
+    with disk_errors(target), temporary_path(target, digest).open("ab") as file:
+        file.write(block)
 
 
 def _finish_file(path: str, target: Path, digest: str) -> None:
@@ -369,8 +364,3 @@ def _strangeness(response: httpx2.Response) -> str:
 def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
     """Return the error for a refused request: RequestError if the request is at fault, ApiError if the service is."""
     return (RequestError if 400 <= status < 500 else ApiError)(message, status, problem)
-
-
-def is_temporary(error: Exception) -> bool:
-    """Return whether the same request may succeed later: there was no response, or it reports a temporary failure."""
-    return isinstance(error, httpx2.RequestError) or (isinstance(error, ApiError) and error.status in _TEMPORARY)

@@ -77,10 +77,10 @@ def test_job_that_ended_early_says_how_little_was_done(files: list[str], sgsst: 
 
 
 def test_service_that_is_not_there_is_reported_at_once(sgsst: Sgsst, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reads are not retried, so nothing is waited for; the port of a closed socket refuses connections."""
+    """Nothing is retried, so nothing is waited for; the port of a closed socket refuses connections."""
     waits: list[float] = []
     monkeypatch.setattr("api.cli.client_commands._print_retry", lambda details: waits.append(details.wait_for))
-    for command in (["status", MISSING], ["jobs"], ["watch", MISSING], ["download", MISSING]):
+    for command in (["status", MISSING], ["jobs"], ["watch", MISSING], ["download", MISSING], ["cancel", MISSING]):
         assert "cannot be reached" in sgsst([*command, "--url", "http://127.0.0.1:9"], 1)
     assert waits == []
 
@@ -222,7 +222,7 @@ def test_share_prints_the_link(files: list[str], sgsst: Sgsst, service: Service)
     assert "days" in sgsst(["share", job_id, "--days", "91"], 2)
 
 
-def test_download_to_a_full_disk_leaves_no_file(
+def test_download_to_a_full_disk_can_be_resumed(
     files: list[str], sgsst: Sgsst, service: Service, tmp_path: Path
 ) -> None:
     job_id = submit(files, sgsst)
@@ -230,7 +230,9 @@ def test_download_to_a_full_disk_leaves_no_file(
     out = tmp_path / "new" / "out.ply"
     with full_disk(100_000):
         assert f"error: {out}: cannot be written: File too large." in sgsst(["download", job_id, "--out", str(out)], 2)
-    assert list(out.parent.iterdir()) == []
+    assert not out.exists()
+    sgsst(["download", job_id, "--out", str(out)])
+    assert [(path, path.stat().st_size) for path in out.parent.iterdir()] == [(out, 200_000)]
 
 
 @pytest.mark.parametrize("job_id", ["", "?", ".", "..", "a/b", "a b#c"])
