@@ -285,7 +285,7 @@ def usage(
         datetime | None, typer.Option(metavar="DAY", help="Last day. [default: today]", formats=["%Y-%m-%d"])
     ] = None,
     data: Annotated[
-        Path | None, typer.Option(help="Read the database of this data folder, instead of asking a service.")
+        Path | None, typer.Option(help="Read the database of this data folder, instead of asking the service of --url.")
     ] = None,
     as_json: JsonOption = False,
     url: UrlOption = None,
@@ -295,8 +295,6 @@ def usage(
 
     A key shows its own usage, an operator's key or --data that of all keys.
     """
-    if data is not None and (url or key):
-        raise SettingsError("--data reads a database, --url and --key ask a service. Omit --data, or the others.")
     first, last = (None if day is None else day.date() for day in (since, until))
     if data is None:
         with open_client(url, key) as client:

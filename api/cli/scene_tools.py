@@ -219,12 +219,9 @@ def view_file_names(cameras: Sequence[Camera]) -> list[str]:
     refuse become underscores.
     """
     digits = max(4, len(str(len(cameras) - 1)))
-    names = []
-    for index, camera in enumerate(cameras):
-        stem = re.sub(r"\.(png|jpe?g|tiff?|webp|bmp|exr)$", "", camera.name, flags=re.IGNORECASE)
-        plain = re.sub(r"[^A-Za-z0-9.-]+", "_", stem).strip("._")[-80:]
-        names.append(f"{index:0{digits}d}_{plain}.png" if plain else f"{index:0{digits}d}.png")
-    return names
+    stems = (re.sub(r"\.(png|jpe?g|tiff?|webp|bmp|exr)$", "", each.name, flags=re.IGNORECASE) for each in cameras)
+    plain = (re.sub(r"[^A-Za-z0-9.-]+", "_", stem).strip("._")[-80:] for stem in stems)
+    return [f"{index:0{digits}d}_{stem}".rstrip("_") + ".png" for index, stem in enumerate(plain)]
 
 
 # --- blend ---------------------------------------------------------------------------------------------------------

@@ -188,12 +188,10 @@ class Service:
                 f"The service at {self.url} requires another API key. Create one with `sgsst keys create NAME` on its "
                 "machine, and enter it in the settings, or set SGSST_URL to this address and SGSST_KEY to the key."
             )
-        if "Location" in error.headers:
-            return f"{self.url} redirects to {error.headers['Location']}. Enter the address of the service itself."
         try:
             return str(json.load(error)["detail"])
         except (ValueError, KeyError, TypeError):
-            return self._foreign(f"HTTP {error.code}")
+            return self._foreign(f"HTTP {error.code} {error.headers.get('Location', '')}".strip())
 
 
 def orbit_options(preset: str, views: int, up: str, minutes: float) -> dict[str, Any]:

@@ -111,7 +111,6 @@ def test_usage_of_own_key_and_of_all_keys(
     period = ["--since", "2026-01-01", "--until", "2026-11-30"]
     error = json.loads(sgsst(["usage", "--data", str(service.data), *period, "--json"], 2))
     assert (error["code"], "334 days" in error["detail"]) == ("invalid-request", True)
-    assert "Omit --data, or the others" in sgsst(["usage", "--data", str(service.data), "--url", service.url], 2)
 
 
 def test_connections_are_limited(service: Service) -> None:

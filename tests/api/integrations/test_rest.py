@@ -55,7 +55,7 @@ def test_key_is_for_one_origin(monkeypatch: pytest.MonkeyPatch) -> None:
         for url, key in given:
             with pytest.raises(sgsst_rest.ServiceError):
                 sgsst_rest.Service(url, key).json("GET", "/v1/jobs")
-        with pytest.raises(sgsst_rest.ServiceError, match=f"redirects to {other}"):
+        with pytest.raises(sgsst_rest.ServiceError, match=rf"\(HTTP 302 {other}/\)\. Correct the address"):
             sgsst_rest.Service().json("GET", "/v1/jobs")
     assert sent == ["Bearer secret", "Bearer secret", None, "Bearer own", "Bearer secret"]
 
