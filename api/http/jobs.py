@@ -367,10 +367,9 @@ async def list_jobs(
 ) -> Response:
     """List the jobs of this key, newest first."""
 
-    def read(before: str | None, most: int) -> tuple[list[schemas.JobView], str | None]:
-        page = context.store.jobs.page(caller.owner, status=status or (), before=before, limit=most + 1)
-        following = page[most - 1].row.id if len(page) > most else None  # one more shows if more follow
-        return [schemas.job_view(job) for job in page[:most]], following
+    def read(before: str | None, most: int) -> list[tuple[str, schemas.JobView]]:
+        page = context.store.jobs.page(caller.owner, status=status or (), before=before, limit=most)
+        return [(job.row.id, schemas.job_view(job)) for job in page]
 
     return await send_list("jobs", read, cursor, limit, context.readers.of(caller.owner), at_once=16)
 
@@ -592,11 +591,9 @@ async def list_inputs(
     """List the files that a job was created from, photos and masks included."""
     await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
 
-    def read(start: str | None, most: int) -> tuple[list[schemas.InputFileView], str | None]:
-        position = int(start or 0)
-        page = context.store.jobs.input_page(job_id, position, most + 1)
-        following = str(position + most) if len(page) > most else None
-        return [schemas.input_view(job_id, *entry) for entry in page[:most]], following
+    def read(start: str | None, most: int) -> list[tuple[str, schemas.InputFileView]]:
+        page = enumerate(context.store.jobs.input_page(job_id, int(start or 0), most), int(start or 0) + 1)
+        return [(str(number), schemas.input_view(job_id, *entry)) for number, entry in page]
 
     return await send_list("inputs", read, str(cursor), limit, context.readers.of(caller.owner))
 
@@ -714,10 +711,9 @@ async def list_artifacts(
     """List the files that a job has made so far, by name. A running job has its plan and previews."""
     await asyncio.to_thread(context.store.jobs.get, job_id, caller.owner)
 
-    def read(after: str | None, most: int) -> tuple[list[schemas.ArtifactView], str | None]:
-        page = context.store.jobs.artifacts(job_id, after or "", most + 1)
-        following = page[most - 1].name if len(page) > most else None
-        return [schemas.artifact_view(row) for row in page[:most] if not row.name.startswith(".")], following
+    def read(after: str | None, most: int) -> list[tuple[str, schemas.ArtifactView | None]]:
+        page = context.store.jobs.artifacts(job_id, after or "", most)
+        return [(row.name, None if row.name.startswith(".") else schemas.artifact_view(row)) for row in page]
 
     return await send_list("artifacts", read, cursor, limit, context.readers.of(caller.owner))
 

@@ -144,8 +144,8 @@ def file_answers(starts: dict[str, Any], *, always_policy: bool = False) -> Resp
 #: Size of the pieces in which a list is sent. No request holds more of it, except the entries that are read at once.
 _PIECE_BYTES = 1 << 16
 
-#: Function that returns up to so many entries after a cursor, and the cursor of the next ones; None for none.
-ReadEntries = Callable[[str | None, int], tuple[Sequence[BaseModel], str | None]]
+#: Function that returns up to so many entries after a cursor, each with the cursor behind it; None is not shown.
+ReadEntries = Callable[[str | None, int], Sequence[tuple[str, BaseModel | None]]]
 
 
 async def send_list(
@@ -183,7 +183,10 @@ async def send_list(
 def _pieces(name: str, read: ReadEntries, cursor: str | None, limit: int, at_once: int) -> Iterator[bytes]:
     text, separator = f'{{"{name}":[', ""
     while True:
-        entries, cursor = read(cursor, min(limit, at_once))
+        most = min(limit, at_once)
+        page = read(cursor, most + 1)  # one more shows if more follow
+        cursor = page[most - 1][0] if len(page) > most else None
+        entries = [entry for _, entry in page[:most] if entry]
         limit -= len(entries)
         if entries:
             text += separator + ",".join(entry.model_dump_json() for entry in entries)
