@@ -11,10 +11,10 @@ import json
 import re
 import secrets
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, suppress
 from email.utils import formatdate
-from functools import partial
+from functools import cache, partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
@@ -330,10 +330,8 @@ async def _append_body(request: Request, context: Context, row: UploadRow, check
         try:
             async for block in receiving.body_blocks(request, context.settings):
                 await run(writer.write, block, size=_SAVE_BYTES)
-        except StoreError:
-            raise
-        except ServiceError:
-            if checksum is None:
+        except ServiceError as error:
+            if checksum is None and not isinstance(error, StoreError):
                 await run(writer.save, size=_SAVE_BYTES)  # no checksum can contradict them
             raise
         return await run(writer.finish, size=row.length if writer.complete else _SAVE_BYTES)
@@ -722,7 +720,7 @@ def _resolve_inputs(
     inputs = list(received.files)
     ids = [text for _, _, text in received.uploads if is_id(text)]
     uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}
-    released: dict[str, bool] = {}
+    is_released = cache(lambda job_id: context.store.jobs.get(job_id, caller.owner).status == JobStatus.EXPIRED)
     resolved: list[tuple[str, str]] = []
     for _, role, text in received.uploads:
         if receiving.is_url(text):
@@ -730,7 +728,7 @@ def _resolve_inputs(
         elif text in fetched:
             resolved.append((RESULT, fetched[text]))
         elif reference := _PATH.fullmatch(text.removeprefix(subpath.get())):
-            entry = _referred_input(context, caller, reference[1], reference[2], role, released)
+            entry = _referred_input(context, reference[1], reference[2], role, is_released)
             resolved.append((entry["name"], entry["sha256"]))
         elif upload := uploads.get(text):
             resolved.append((uploaded_name(upload.metadata_header), _upload_digest(context, upload, role)))
@@ -754,9 +752,7 @@ async def _adopt_results(
     Raises:
         UNKNOWN_INPUT: If a job does not exist, or has no result.
     """
-    results = {}
-    if any(_RESULT_PATH.fullmatch(text.removeprefix(subpath.get())) for *_, text in received.uploads):
-        results = await asyncio.to_thread(_referred_results, context, caller, received)
+    results = await asyncio.to_thread(_referred_results, context, caller, received)
     run = partial(context.threads.run, caller.owner, _adopt_result, context, receipt)
     return {path: await run(row, size=row.size) for path, row in results.items()}
 
@@ -783,21 +779,19 @@ def _adopt_result(context: Context, receipt: receiving.Receipt, row: ArtifactRow
 
 
 def _referred_input(
-    context: Context, caller: Caller, job_id: str, name: str, role: str, released: dict[str, bool]
+    context: Context, job_id: str, name: str, role: str, is_released: Callable[[str], bool]
 ) -> dict[str, Any]:
     """Return the entry of an input of one of the caller's jobs. No other entry of the job is read.
 
     Args:
-        released: Whether jobs that other references name have released their inputs; this one's job is added.
+        is_released: Function that returns whether one of the caller's jobs has released its inputs.
 
     Raises:
         UNKNOWN_INPUT: If the input does not exist, or was released.
     """
     with suppress(NotFoundError):
-        if job_id not in released:
-            released[job_id] = context.store.jobs.get(job_id, caller.owner).status == JobStatus.EXPIRED
         place = parse_input(name)
-        entry = context.store.jobs.input(job_id, *place) if place and not released[job_id] else None
+        entry = context.store.jobs.input(job_id, *place) if place and not is_released(job_id) else None
         if entry is not None:
             return entry
     raise problems.UNKNOWN_INPUT(job_id=job_id, name=name, input=role)

@@ -12,7 +12,6 @@ import httpx2
 import pytest
 from sqlalchemy import event
 
-from api.http.context import Caller
 from api.http.sending import disposition
 from api.http.submission import _referred_input
 from service.files.objects import Artifacts
@@ -227,7 +226,7 @@ def test_reference_reads_no_other_entry(tmp_path: Path) -> None:
     read: list[str] = []
     event.listen(store.database.engine, "before_cursor_execute", lambda *each: read.append(each[2]))
     context: Any = SimpleNamespace(store=store)
-    assert _referred_input(context, Caller("local", 0), job.id, "style:1", "style", {}) == entries[1]
+    assert _referred_input(context, job.id, "style:1", "style", lambda _: False) == entries[1]
     assert not [statement for statement in read if statement.startswith("SELECT jobs.inputs")]
     assert len([statement for statement in read if "json_each" in statement and "LIMIT 1" in statement]) == 1
     store.close()
