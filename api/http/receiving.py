@@ -146,8 +146,6 @@ class Receipt:
 
 #: Maximum bytes of a text field: JSON parameters or an id.
 MAX_TEXT = 1 << 16
-#: Media types of the body of a new job.
-MEDIA_TYPES = "multipart/form-data or application/json"
 #: Maximum bytes of a small JSON body.
 _MAX_SMALL = 4096
 _TEXT_FIELDS = ("parameters", "webhook", "webhook_events")
@@ -275,7 +273,7 @@ async def receive(
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data":
-        raise problems.UNSUPPORTED_TYPE(supported=MEDIA_TYPES)
+        raise problems.UNSUPPORTED_TYPE(supported="multipart/form-data or application/json")
     if not boundary:
         raise problems.MALFORMED_BODY("The Content-Type multipart/form-data must name a boundary.")
     await asyncio.to_thread(receipt.charge, declared_bytes(request, settings.max_request_bytes))
@@ -480,7 +478,6 @@ def parse_json(text: str, what: str) -> Any:
         gc.enable()
 
 
-_REDIRECTS = (301, 302, 303, 307, 308)
 _MAX_REDIRECTS = 5
 #: Maximum number of requests of one owner that fetch inputs at the same time.
 _REQUESTS_PER_OWNER = 4
@@ -601,8 +598,7 @@ class Fetcher:
         for _ in range(1 + _MAX_REDIRECTS):
             answer = send("GET", url, _HEADERS, private_allowed=self._settings.url_private_addresses)
             response = await self._in_time(source, stack.enter_async_context(answer))
-            location = response.headers.get("location")
-            if response.status_code not in _REDIRECTS or location is None:
+            if not response.has_redirect_location:
                 if response.status_code != httpx2.codes.OK:
                     raise _not_fetched(source, f"the server answered {response.status_code}")
                 if response.headers.get("content-encoding", "identity").strip().lower() != "identity":
@@ -610,7 +606,7 @@ class Fetcher:
                 return response
             await stack.aclose()
             try:
-                target = str(url.join(location))
+                target = str(url.join(response.headers["location"]))
             except (httpx2.InvalidURL, ValueError) as error:
                 raise _not_fetched(source, _INVALID_REDIRECT) from error
             url = self._parse(target, source.url, source.role)
