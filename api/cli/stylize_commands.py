@@ -25,18 +25,16 @@ from api.cli.options import (
     JobArguments,
     KeyOption,
     file_to_write,
-    flags,
     folder_to_write,
     local_path,
     path_to_read,
     with_arguments,
     with_options,
 )
-from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, WeightsError, is_out_of_memory
+from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError, is_out_of_memory
 from sgsst_core.files.atomic import file_digest, write_json
 from sgsst_core.files.formats import EXTRA_SUFFIXES, SUFFIXES, scene_path
 from sgsst_core.progress import job_bar
-from sgsst_core.settings import declared
 from worker.job import JobSpec, Outputs, Result, check_is_not_input, check_request
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 from worker.processes import HANGUP, STOP_SIGNALS
@@ -364,11 +362,6 @@ def batch(
     """
     from api.client.client import different_names
 
-    if url is None and key is not None:
-        raise SettingsError("--key requires --url. Add it, or omit --key.")
-    if url is not None and run.model_fields_set:
-        option = flags(declared(RunOptions)[min(run.model_fields_set)])
-        raise SettingsError(f"{option}: is for results that this machine makes. Omit it, or --url.")
     results = _Batch(out)
     jobs = {}
     named = (zip(different_names([*map(_namesake, paths)]), paths, strict=True) for paths in (scenes, style))

@@ -77,21 +77,6 @@ def test_missing_scenes_and_foreign_records_are_named(arguments: list[str], tmp_
     assert record.read_text() == "[1]"
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--rank-timeout", "60", "--url", "http://127.0.0.1:1"], "--rank-timeout: is for results that this machine"),
-        (["--checkpoint-seconds", "60", "--url", "http://127.0.0.1:1"], "--checkpoint-seconds: is for results that"),
-        (["--key", "secret"], "--key requires --url."),
-    ],
-)
-def test_options_of_the_other_place_are_refused(
-    arguments: list[str], tmp_path: Path, sgsst: Sgsst, options: list[str], message: str
-) -> None:
-    assert message in sgsst([*arguments, *options], 2)
-    assert not (tmp_path / "out").exists()
-
-
 def test_results_have_different_names(tmp_path: Path, sgsst: Sgsst) -> None:
     for name in ("a.ply", "a_b.ply", "b_c.png", "c.png"):
         (tmp_path / name).write_bytes(b"neither scene nor image")
