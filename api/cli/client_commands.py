@@ -27,12 +27,7 @@ from service.inputs import JobParameters
 from service.states import ACTIONS, STEPPING, Transition, WebhookEvent
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.atomic import file_digest
-from sgsst_core.files.formats import (
-    DOWNLOAD_SUFFIXES,
-    download_of_name,
-    listed,
-    result_name,
-)
+from sgsst_core.files.formats import DOWNLOAD_SUFFIXES, download_of_name, listed, result_name
 from sgsst_core.progress import Progress, duration, live_bar
 from worker.job import check_file, check_folder, check_is_not_input
 from worker.options import ESSENTIALS, RegionOptions, parse_styles, path_or_url, region_requests, split_weight
@@ -298,7 +293,7 @@ def usage(
     first, last = (None if day is None else day.date() for day in (since, until))
     if data is None:
         with open_client(url, key) as client:
-            rows = client.usage(first and first.isoformat(), last and last.isoformat())
+            rows = client.usage(str(first) if first else None, str(last) if last else None)
     else:
         from api.cli.machine_commands import usage_of_all
 

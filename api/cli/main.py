@@ -12,14 +12,7 @@ import typer
 
 from api import installed_version
 from api.cli import ABORTED, INTERRUPTED
-from api.cli.console import (
-    BAD_INPUT,
-    CONFLICT,
-    FAILURE,
-    NOT_FOUND,
-    Invocation,
-    error_console,
-)
+from api.cli.console import BAD_INPUT, CONFLICT, FAILURE, NOT_FOUND, Invocation, error_console
 from service.states import ACTIONS
 from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import DISK_FULL

@@ -288,8 +288,9 @@ class AsyncClient:
         artifacts: list[dict[str, Any]] = []
         cursor: str | None = ""
         while cursor is not None:
-            query = {"cursor": cursor} if cursor else {}
-            page = await self._transport.json("GET", f"{_job_path(job_id)}/artifacts", params=query)
+            page = await self._transport.json(
+                "GET", f"{_job_path(job_id)}/artifacts", params={"cursor": cursor} if cursor else {}
+            )
             artifacts += page["artifacts"]
             cursor = page.get("next_cursor")  # services of earlier versions send all at once
         return artifacts

@@ -357,8 +357,10 @@ def _strangeness(response: httpx2.Response) -> str:
     """Return what distinguishes a response from those of the service."""
     location, kind = response.headers.get("location"), response.headers.get("content-type", "no JSON")
     what = f"redirects to {location}" if location else f"sends {kind}"
-    url, status = response.request.url, response.status_code
-    return f"{url} answers {status} and {what}, which the service does not. Check the address."
+    return (
+        f"{response.request.url} answers {response.status_code} and {what}, which the service does not. Check the "
+        "address."
+    )
 
 
 def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:

@@ -23,16 +23,7 @@ from api.http import access, jobs, monitoring, submission
 from api.http.context import Context, Rates
 from api.http.jobs import Hub
 from api.http.monitoring import Metrics, Readiness
-from api.http.problems import (
-    HANDLERS,
-    METHODS,
-    Problem,
-    complete,
-    from_service,
-    logged_path,
-    route_of,
-    routed_methods,
-)
+from api.http.problems import HANDLERS, METHODS, Problem, complete, from_service, logged_path, route_of, routed_methods
 from api.http.receiving import Fetcher, Receipts
 from api.http.schemas import ANSWERS, path_of, subpath
 from api.http.sending import add_static
@@ -110,7 +101,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         threads.close()
         store.close()
 
-    app = _App(
+    app = FastAPI(
         title="sgsst",
         version=installed_version(),
         description=_DESCRIPTION,
@@ -120,7 +111,6 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         redoc_url=None,
         exception_handlers=HANDLERS,
     )
-    app.settings = settings
     routers = [
         *(submission.router, jobs.router, jobs.inputs_router, jobs.artifacts_router, access.router),
         *(submission.uploads_router, access.session_router, monitoring.router),
@@ -130,7 +120,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     add_static(app)
     app.add_middleware(Deadlines, seconds=settings.answer_seconds)
 
-    plain = app.openapi
+    build, plain = app.build_middleware_stack, app.openapi
 
     def openapi() -> dict[str, Any]:
         if not app.openapi_schema:
@@ -139,17 +129,9 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         return app.openapi_schema or {}
 
     app.openapi = openapi  # type: ignore[method-assign]
+    # around FastAPI's own middleware, which responds to unexpected errors
+    app.build_middleware_stack = lambda: Observed(Adapted(build(), settings), app.state)  # type: ignore[method-assign]
     return app
-
-
-class _App(FastAPI):
-    """FastAPI with middleware around its own, which responds to unexpected errors."""
-
-    settings: ServiceSettings
-
-    def build_middleware_stack(self) -> ASGIApp:
-        """Return the app with all middleware."""
-        return Observed(Adapted(super().build_middleware_stack(), self.settings), self.state)
 
 
 #: Path of the uploads, whose protocol lets a header replace the method, for clients that can only send GET and POST.

@@ -212,8 +212,7 @@ async def readyz(context: ContextDep) -> Response:
         checks["dispatchers"] = str(alive or "none")
     if not ready:
         return JSONResponse(Health(status="unavailable", checks=checks).model_dump(), 503, {"Retry-After": "5"})
-    view = Health(status="ok" if alive else "waiting", checks=checks)
-    return JSONResponse(view.model_dump())
+    return JSONResponse(Health(status="ok" if alive else "waiting", checks=checks).model_dump())
 
 
 def _day(text: object) -> object:

@@ -133,8 +133,9 @@ async def _system_error(request: Request, error: OSError) -> JSONResponse:
         return from_service(problems.NO_SPACE())
     if error.errno not in (errno.EMFILE, errno.ENFILE):
         raise error
-    detail = "The service has reached its limit of open files. Try again later."
-    return from_service(problems.TOO_MANY_CONNECTIONS(detail))
+    return from_service(
+        problems.TOO_MANY_CONNECTIONS("The service has reached its limit of open files. Try again later.")
+    )
 
 
 async def _unexpected(request: Request, error: Exception) -> JSONResponse:
@@ -431,8 +432,8 @@ def _is_limited(parameter: dict[str, Any]) -> bool:
     """Return whether there are values that a parameter may not have."""
     schema = parameter["schema"]
     known = schema.keys() | schema.get("anyOf", [{}])[0].keys()
-    limited = not known.isdisjoint(("le", "lt", "pattern", "maxLength", "enum"))
-    return limited and parameter["name"] != "Tus-Resumable"  # which has a problem of its own
+    # Tus-Resumable has a problem of its own
+    return parameter["name"] != "Tus-Resumable" and not known.isdisjoint(("le", "lt", "pattern", "maxLength", "enum"))
 
 
 def links(*operations: str, **parameters: str) -> dict[str, Any]:

@@ -593,32 +593,28 @@ def view_of(model: type[Model], row: Base, **given: Any) -> Model:
 
 def job_view(shown: ShownJob) -> JobView:
     """Return a job as the API shows it."""
-    return view_of(JobView, shown.row, **_given_fields(shown))
+    job = shown.row
+    base = address(f"/v1/jobs/{job.id}")
+    result = f"{base}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None
+    return view_of(
+        JobView,
+        job,
+        queue_position=shown.position,
+        preview=shown.preview,
+        # The remaining time is that of the last report, and a job that has ended has none.
+        progress={**job.progress, **({} if job.status in UNFINISHED else {"eta_s": None})} if job.progress else None,
+        error=job.error or None,
+        viewpoints=job.viewpoints or {},
+        parameters=JobParameters().model_dump(mode="json") | job.parameters,
+        inputs=shown.inputs,
+        input_counts=shown.input_counts,
+        links=Links(self=base, events=f"{base}/events", artifacts=f"{base}/artifacts", result=result),
+    )
 
 
 def job_detail(shown: ShownJob, attempts: Sequence[AttemptRow]) -> JobDetail:
     """Return a job with its attempts."""
-    views = [view_of(AttemptView, row) for row in attempts]
-    return view_of(JobDetail, shown.row, **_given_fields(shown), attempts=views)
-
-
-def _given_fields(shown: ShownJob) -> dict[str, Any]:
-    """Return the fields of a job that are not columns of its row."""
-    job = shown.row
-    base = address(f"/v1/jobs/{job.id}")
-    result = f"{base}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None
-    return {
-        "queue_position": shown.position,
-        "preview": shown.preview,
-        # The remaining time is that of the last report, and a job that has ended has none.
-        "progress": {**job.progress, **({} if job.status in UNFINISHED else {"eta_s": None})} if job.progress else None,
-        "error": job.error or None,
-        "viewpoints": job.viewpoints or {},
-        "parameters": JobParameters().model_dump(mode="json") | job.parameters,
-        "inputs": shown.inputs,
-        "input_counts": shown.input_counts,
-        "links": Links(self=base, events=f"{base}/events", artifacts=f"{base}/artifacts", result=result),
-    }
+    return JobDetail(**vars(job_view(shown)), attempts=[view_of(AttemptView, row) for row in attempts])
 
 
 def input_view(job_id: str, index: int, entry: dict[str, Any]) -> InputFileView:
