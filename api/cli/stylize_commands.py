@@ -10,7 +10,7 @@ import json
 import shlex
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -125,7 +125,7 @@ def run_job(
     outputs, stop, notify = check_request(request), StopFlag(), console.error_console.print
     with ExitStack() as stack:
         if workers is not None:  # the processes of ranks are ended in order even before the first step
-            stack.enter_context(stop.on_signal(_announce_stop))
+            stack.enter_context(stop.on_signal())
         bar = stack.enter_context(job_bar(console.error_console))
         from sgsst_core.compiled import compilations_reported  # takes seconds to import
 
@@ -133,7 +133,7 @@ def run_job(
 
         def prepared(summary: Prepared) -> None:
             if workers is None:
-                stack.enter_context(stop.on_signal(_announce_stop))
+                stack.enter_context(stop.on_signal())
             for heading, line in summary.lines:
                 console.print_field(heading, line)
 
@@ -150,10 +150,6 @@ def run_job(
         )
     assert ended.result is not None
     _print_result(outputs, ended.result, command)
-
-
-def _announce_stop() -> None:
-    console.error_console.print("Stopping after this step. Press Ctrl-C again to abort immediately.")
 
 
 def _print_interruption(outputs: Outputs, ended: Ended, command: str) -> None:
@@ -217,8 +213,8 @@ class StopFlag:
         return 128 + (self._signal or signal.SIGINT)
 
     @contextmanager
-    def on_signal(self, announce: Callable[[], None]) -> Iterator[None]:
-        """Set this flag at the first Ctrl-C, SIGTERM or SIGHUP, and call `announce`.
+    def on_signal(self) -> Iterator[None]:
+        """Set this flag at the first Ctrl-C, SIGTERM or SIGHUP, and announce that the program stops after its step.
 
         A second Ctrl-C or SIGTERM has its usual effect. SIGHUP, which arrives when the terminal is closed, never has:
         both the shell and the system send it. Like others, it stays ignored if it is, as by `nohup`. Outside the main
@@ -232,7 +228,7 @@ class StopFlag:
             for other, handler in before.items():
                 signal.signal(other, handle if other == HANGUP else handler)
             console.leave_terminal(number)
-            announce()
+            console.error_console.print("Stopping after this step. Press Ctrl-C again to abort immediately.")
 
         try:
             for number in before:

@@ -310,7 +310,7 @@ def test_closed_terminal_never_aborts() -> None:
         "import signal",
         "from api.cli.stylize_commands import StopFlag",
         "stop = StopFlag()",
-        "with stop.on_signal(lambda: None):",
+        "with stop.on_signal():",
         "    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGHUP):",
         "        signal.raise_signal(number)",
         "signal.raise_signal(signal.SIGHUP)",
