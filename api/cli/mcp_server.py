@@ -21,7 +21,7 @@ from api import installed_version
 from api.client import AsyncClient
 from api.client.client import IMAGE_SUFFIXES, input_files
 from api.client.transport import Job
-from service.inputs import JobParameters
+from service.inputs import RESULT, JobParameters
 from sgsst_core.errors import SgsstError
 from sgsst_core.files import formats
 from sgsst_core.files.formats.ply import PLY
@@ -32,8 +32,6 @@ Style transfer for 3D Gaussian Splatting scenes: the colors of a scene are optim
 painting. Call `estimate` to learn how long a job takes, `submit` to queue it, `status` every few seconds until it has
 ended, and `result` for a preview and the stylized scene. `blend` mixes the scene with its result, or with several.
 """
-#: Artifact with the stylized scene.
-_RESULT = "stylized.ply"
 #: Suffixes of the files that are read, by role.
 _SUFFIXES = {
     "scene": tuple(each.suffix for each in formats.FORMATS),
@@ -108,7 +106,7 @@ class Tools:
             target = self._new_file(out, [f".{name}" for name in formats.DOWNLOADS])
             job = await self._client.job(job_id)
             artifacts = await self._client.artifacts(job_id)
-            path = target and str(await self._client.download(job_id, target, _RESULT))
+            path = target and str(await self._client.download(job_id, target, RESULT))
             preview = job.data["preview"]
             image = None
             if preview:
