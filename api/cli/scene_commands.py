@@ -363,8 +363,7 @@ def paint(
     paintings = tuple(PaintedFile.parse(text) for text in view or ())
     request = JobSpec(source=source, styles=(), out=out, settings=settings, paintings=paintings)
     with counting_bar("painting", in_bytes=False) as progress:
-        listener = Listener(progress=lambda now: progress(now.step, now.total))
-        result = run_painting(request, listener, WorkerOptions())
+        result = run_painting(request, Listener(progress=lambda now: progress(now.step, now.total)), WorkerOptions())
     print_field("painted pixels", f"{result.psnr_before:.1f} dB before, {result.psnr_after:.1f} dB after")
     print_field("scene", out)
     print_field("report", Outputs.of(out).report)

@@ -99,8 +99,7 @@ def make_plan(
     inputs = read_inputs(request)
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
-        scene = inputs.scene_file.scene
-        write_views(sheet, scene, inputs.cameras, background=settings.background, near=settings.near)
+        write_views(sheet, inputs.scene_file.scene, inputs.cameras, background=settings.background, near=settings.near)
     job = dry_run(request, inputs, show_planning, left=left)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan := plan_json(job))

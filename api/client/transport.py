@@ -175,7 +175,7 @@ class Transport:
     async def _retry(self, once: Callable[[], Awaitable[T]]) -> T:
         try:
             return await self._retrying(self.may_pass, once)
-        except httpx2.RequestError as error:
+        except (httpx2.RequestError, OverflowError) as error:  # the latter for the port of a proxy
             raise self.unreachable(error) from None
 
 

@@ -151,18 +151,13 @@ class Hub:
             return []
 
     async def _poll(self) -> None:
-        unavailable = False
         while True:
             await asyncio.sleep(_POLL_SECONDS)
-            if not self._watched:
-                continue
             try:
-                await self._find_new_events()
-                unavailable = False
-            except DatabaseUnavailableError as error:  # Watchers wait until the database is back.
-                if not unavailable:
-                    _log.warning("cannot read events: %s", error)
-                unavailable = True
+                if self._watched:
+                    await self._find_new_events()
+            except DatabaseUnavailableError:
+                pass  # watchers wait until the database is back; requests and checks report the outage
             except Exception:
                 _log.exception("reading events failed")
 

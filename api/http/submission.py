@@ -673,8 +673,7 @@ def _queue_job(
     if not created:
         response_headers["Idempotency-Replayed"] = "true"
     shown = jobs.shown_new(job) if created else jobs.detail(job.id, caller.owner)[0]
-    body = job_view(shown).model_dump_json()
-    return Response(body, 202, response_headers, media_type="application/json")
+    return Response(job_view(shown).model_dump_json(), 202, response_headers, media_type="application/json")
 
 
 #: Files and texts of a request, with the parameters and the webhook of the job.

@@ -15,8 +15,11 @@ PROGRAMS = {"blender": "", "comfyui": "sgsst/", "lichtfeld": "sgsst/"}
 def build(program: str, folder: Path) -> Path:
     """Write the package of a program to a folder, with the shared module and the license; return its path."""
     path = folder / f"sgsst-{program}.zip"
-    sources = [file for file in sorted((_HERE / program).rglob("*")) if file.is_file() and file.suffix != ".pyc"]
-    named = {file.relative_to(_HERE / program).as_posix(): file for file in sources}
+    named = {
+        file.relative_to(_HERE / program).as_posix(): file
+        for file in sorted((_HERE / program).rglob("*"))
+        if file.is_file() and file.suffix != ".pyc"
+    }
     named["sgsst_rest.py"] = _HERE / "sgsst_rest.py"
     named["LICENSE"] = _HERE.parents[1] / "LICENSE"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
