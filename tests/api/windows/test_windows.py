@@ -139,7 +139,7 @@ def test_output_that_another_program_holds_open_is_kept_beside_it(windows: Windo
     assert code == 0, output
     assert "held.ply: cannot be replaced" in output
     assert (windows.folder / "held.ply").read_text() == "old"
-    (remaining,) = windows.folder.glob(".sgsst-*.part.ply")
+    (remaining,) = windows.folder.glob("held-*.new.ply")
     assert remaining.read_text() == "new"
 
 
