@@ -143,8 +143,7 @@ def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:
         text = f"wrong {check.name}: {check.error:.3g} exceeds {check.bound:.3g}"
         yield Diagnosis("results", "problem", f"{text}. Do not trust results of this machine.")
     if not wrong:
-        text = f"{len(checks)} checks pass, and results repeat bit by bit"
-        yield Diagnosis("results", "works", text)
+        yield Diagnosis("results", "works", f"{len(checks)} checks pass, and results repeat bit by bit")
 
 
 def _precision() -> Diagnosis:

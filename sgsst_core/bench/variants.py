@@ -308,11 +308,11 @@ def _measures(point: Point) -> dict[str, float | None]:
 def _draw_curves(axes: "Axes", curves: Sequence[Curve], title: str) -> None:
     """Draw a measure of points against seconds with one line per curve."""
     for index, curve in enumerate(curves):
-        known = {point.seconds: value for point in curve.points if (value := _measures(point).get(title))}
-        if known:
+        values = page.column([_measures(point).get(title) for point in curve.points])
+        if (values > 0).any():
             axes.plot(
-                list(known.keys()),
-                list(known.values()),
+                [point.seconds for point in curve.points],
+                values,
                 marker=_MARKERS[index % len(_MARKERS)],
                 markersize=4,
                 linewidth=1,

@@ -301,7 +301,10 @@ def _to_rgb(path: Path, image: Image.Image, profile: "ColorProfile | None", back
         white = white if values.max() <= _OVERSHOOT * white else values.max()
         gray = np.clip(values / white, 0, 1)
         if profile is None:
-            return np.repeat(gray[:, :, None], 3, axis=2)
+            colors = np.repeat(gray[:, :, None], 3, axis=2)
+            if isinstance(key := image.info.get("transparency"), int):
+                colors[values == key] = background
+            return colors
         image = Image.fromarray(np.rint(255 * gray).astype(np.uint8))
     transparent = image.has_transparency_data
     if transparent:

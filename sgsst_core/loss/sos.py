@@ -464,8 +464,7 @@ class TargetBuilder:
         """Downscale coverage [H, W] in 0..1 by every power of two that a layer needs at some scale."""
         coarsest = self._loss.divider.tiling.scales(_size(coverage))[-1]
         levels = coarsest + 1 + layer_stride("relu5_1").bit_length()
-        dtype = torch.promote_types(self._loss.network.dtype, torch.float32)
-        finest = coverage.to(self._loss.network.device, dtype)
+        finest = coverage.to(self._loss.network.device, torch.promote_types(self._loss.network.dtype, torch.float32))
         return [downscale(finest, level) for level in range(levels)]
 
     def content_features(self, content: parallel.ScaledView, tiles: Sequence[PartitionTile]) -> ContentFeatures:

@@ -199,6 +199,12 @@ def test_overshoot_of_float_pixels_is_clipped(tmp_path: Path) -> None:
         assert image[0, :, 0].tolist() == pytest.approx(expected)
 
 
+def test_transparent_16_bit_gray_is_composited(tmp_path: Path) -> None:
+    values = np.array([[1000, 2000]], dtype="u2")
+    image = load_image(save(tmp_path / "a.png", Image.fromarray(values), transparency=1000))
+    assert (image[0, 0].tolist(), image[0, 1].tolist()) == ([1, 1, 1], pytest.approx([2000 / 65535] * 3))
+
+
 def test_non_finite_float_pixels_are_refused(tmp_path: Path) -> None:
     path = save(tmp_path / "a.tif", Image.fromarray(np.array([[0.5, np.nan]], dtype="f4")))
     with pytest.raises(ImageError, match="NaN or infinite pixels"):
