@@ -138,13 +138,14 @@ def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, secon
     return ImpatientConnection.connect(*arguments, **options)
 
 
-def _check_open(connection: Any, _record: Any, _proxy: Any) -> None:
+def _check_open(connection: Any, record: Any, _proxy: Any) -> None:
     """Have the pool replace a connection that the server has closed.
 
     An idle server sends nothing but the end of the connection, so no query has to wait for an answer.
     """
-    if connection.closed or wait([connection], 0):
+    if "used" in record.info and (connection.closed or wait([connection], 0)):  # a new one was open just now
         raise DisconnectionError
+    record.info["used"] = True
 
 
 Clock = Callable[[], float]
@@ -243,12 +244,12 @@ class Database:
 
     @contextmanager
     def reading_rows(self, *, one_snapshot: bool = False) -> Iterator[Connection]:
-        """Provide a connection as `reading` does, but without the ORM.
+        """Provide a connection for reading, without the ORM, that never waits for a writer.
 
         This takes a third of the time, which matters for queries that run hundreds of times per second.
 
         Args:
-            one_snapshot: Whether all statements see one snapshot; otherwise, each sees its own.
+            one_snapshot: Whether all statements see one snapshot; otherwise, each may see its own.
         """
         with self._reads.guarded(), (self._reader if one_snapshot else self._single).connect() as connection:
             yield connection

@@ -360,7 +360,8 @@ class Jobs:
         values = new.row(now)
         job = JobRow(**values)
         with self._database.writing() as session:
-            # before the lock, which the owner's other requests wait for, come rows that no other transaction sees
+            # Before the lock, which the owner's other requests wait for, come rows that no other transaction sees. A
+            # request that is refused, and one that is repeated, roll them back.
             session.execute(_ADD_JOB, values)
             add_status_event(session, job, now)
             lock_owner(session, new.owner)
@@ -374,12 +375,12 @@ class Jobs:
                 used_key.created_id = job.id
             _check_queue(session, new.owner, limit, own=1)
             count_job(session, new.owner, quotas, now, sum(entry["size"] for entry in new.inputs))
+            if receipt is not None:
+                close_receipt(session, receipt)
             digests = {entry["sha256"] for entry in new.inputs}
             held = session.execute(_HOLD, {"holder": holder_name(job.id), "digests": list(digests)})
             if held.rowcount < len(digests):  # type: ignore[attr-defined]
                 raise problems.NOT_FOUND("An input was deleted while it was being checked. Upload it again.")
-            if receipt is not None:
-                close_receipt(session, receipt)
             check_bytes(session, new.owner, quotas)
             count(session, "sgsst_jobs_submitted_total")
         return job, True

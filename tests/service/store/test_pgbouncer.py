@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import create_engine, text
 from sqlalchemy.engine import make_url
 
 from service.store import open_store
 from tests.api.service import wait_for
 from tests.ports import free_port
 from tests.postgres import fresh_database
-from tests.service.store.helpers import store_settings
+from tests.service.store.helpers import SHA, queue, store_settings
 
 CONFIGURATION = """
 [databases]
@@ -68,10 +69,25 @@ def test_statements_repeat_on_shared_connections(pooled: str, tmp_path: Path) ->
     """The second process executes what the first would have prepared under the same name, on the same connection."""
     first, second = (open_store(store_settings(tmp_path, pooled)) for _ in range(2))
     try:
+        first.inputs.add_blob(SHA, "blob", 3)
         for number in range(REPEATED):
             for store in (first, second):
-                store.keys.create(f"key {number}")
-        assert len(first.keys.all()) == 2 * REPEATED
+                _, text = store.keys.create(f"key {number}")
+                assert store.keys.find(text) is not None
+                queue(store)
+        assert len(first.keys.all()) == len(second.jobs.page(None)) == 2 * REPEATED
     finally:
         first.close()
         second.close()
+
+
+def test_connection_that_the_server_has_closed_is_replaced(postgres: str, tmp_path: Path) -> None:
+    store = open_store(store_settings(tmp_path, fresh_database(postgres)))
+    try:
+        store.keys.all()
+        with create_engine(store.database.url).connect() as other:
+            ended = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = current_database()"
+            assert other.execute(text(f"{ended} AND pid != pg_backend_pid()")).all()
+        assert store.keys.all() == []
+    finally:
+        store.close()

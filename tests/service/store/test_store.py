@@ -127,6 +127,15 @@ def test_concurrent_requests_with_one_idempotency_key_create_one_job(store: Stor
     at_once(create, 8)
     assert len({job_id for job_id, _ in outcomes}) == 1
     assert sum(created for _, created in outcomes) == 1
+    assert [len(store.jobs.events(shown.row.id, 0)) for shown in store.jobs.page(None)] == [1]
+
+
+def test_job_whose_input_was_deleted_meanwhile_is_not_queued(store: Store, clock: Clock) -> None:
+    clock.now += GRACE_SECONDS + 1
+    assert store.inputs.collect()
+    with raises_problem(problems.NOT_FOUND):
+        queue(store)
+    assert store.jobs.page(None) == []
 
 
 def test_concurrent_dispatchers_lease_every_job_once(store: Store) -> None:
