@@ -33,7 +33,8 @@ def main(wheels: list[Path]) -> None:
         wheels: Wheels of PyTorch without CUDA, one per CPU architecture of the images.
     """
     extras = [word for extra in ("service", "postgresql", "s3", "video") for word in ("--extra", extra)]
-    pinned = _compile(str(ROOT / "pyproject.toml"), *extras)
+    # pip is in the images, because it fetches VGG16
+    pinned = _compile(str(ROOT / "pyproject.toml"), *extras) | _compile("-", given="pip\n")
     cuda = {name for name in pinned if name in cuda_packages() or name == "torch"}
     _write("common", {name: text for name, text in pinned.items() if name not in cuda})
     _write("cuda", {name: pinned[name] for name in cuda})
