@@ -87,5 +87,4 @@ def _script(files: dict[str, bytes], entry: str) -> str:
         f"modules[{json.dumps(name)}] = (() => {{\n{code}\nreturn {{ {', '.join(sorted(imported[name]))} }};\n}})();"
         for name, code in codes.items()
     ]
-    script = "\n".join(['"use strict";', "const modules = {};", *parts])
-    return script.replace(_WORKER_START, "exported.worker")
+    return "\n".join(['"use strict";', "const modules = {};", *parts]).replace(_WORKER_START, "exported.worker")

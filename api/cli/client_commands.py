@@ -274,13 +274,15 @@ def jobs(
 
 def usage(
     since: Annotated[
-        datetime | None, typer.Option(metavar="DAY", help="First day (UTC). [default: 30 days]", formats=["%Y-%m-%d"])
+        datetime | None,
+        typer.Option(metavar="YYYY-MM-DD", help="First day (UTC). [default: 30 days]", formats=["%Y-%m-%d"]),
     ] = None,
     until: Annotated[
-        datetime | None, typer.Option(metavar="DAY", help="Last day. [default: today]", formats=["%Y-%m-%d"])
+        datetime | None, typer.Option(metavar="YYYY-MM-DD", help="Last day. [default: today]", formats=["%Y-%m-%d"])
     ] = None,
     data: Annotated[
-        Path | None, typer.Option(help="Read the database of this data folder, instead of asking the service of --url.")
+        Path | None,
+        typer.Option(help="Read the database of this data folder, without asking the service of --url and --key."),
     ] = None,
     as_json: JsonOption = False,
     url: UrlOption = None,

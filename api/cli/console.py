@@ -101,7 +101,7 @@ def counting_bar(description: str, *, in_bytes: bool = True) -> Iterator[Callabl
 
 
 def leave_terminal(number: int | None) -> None:
-    """Discard what is written to a terminal from now on if a signal says that it is closed: writing would fail."""
+    """Discard what is written to a terminal from now on if it is closed, of which SIGHUP tells: writing would fail."""
     with Path(os.devnull).open("wb") as nowhere:
         for descriptor in (1, 2):
             if number == HANGUP and stat.S_ISCHR(os.fstat(descriptor).st_mode):

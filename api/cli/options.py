@@ -69,8 +69,7 @@ def with_arguments(group: type) -> Callable[[Command], Command]:
     Args:
         group: Dataclass whose fields are annotated with `typer.Argument` or `typer.Option`.
     """
-    parameters = inspect.signature(group, eval_str=True).parameters
-    return _expanding("inputs", parameters, lambda given: group(**given))
+    return _expanding("inputs", inspect.signature(group, eval_str=True).parameters, lambda given: group(**given))
 
 
 def _expanding(

@@ -96,6 +96,9 @@ def make_plan(
         check_suffix(sheet, "a JPEG file", "views.jpg")
         for style in itertools.chain(request.styles, *(region.styles for region in request.regions)):
             check_is_not_input(sheet, style.path, "style image")
+        folders = [request.images, *(each.selection.path for each in request.regions if each.selection)]
+        if any(folder and sheet.resolve().is_relative_to(folder.resolve()) for folder in folders):
+            raise SettingsError(f"{sheet}: is among the photos or masks. Name another file.")
     inputs = read_inputs(request)
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
@@ -246,8 +249,7 @@ def blend_files(
         raise SettingsError("There is one scene to blend. Give at least two, such as scene.ply:0.3 stylized.ply:0.7.")
     fractions = normalized(weights)
     parts = [(SceneRequest.of(path, None, options), weight) for path, weight in zip(paths, weights, strict=True)]
-    warnings = blend(parts, out)
-    return list(zip(paths, fractions, strict=True)), warnings
+    return list(zip(paths, fractions, strict=True)), blend(parts, out)
 
 
 # --- bench -----------------------------------------------------------------------------------------------------------

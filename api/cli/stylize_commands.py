@@ -31,7 +31,7 @@ from api.cli.options import (
     with_arguments,
     with_options,
 )
-from sgsst_core.errors import InvalidInputError, SgsstError, WeightsError, is_out_of_memory
+from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, WeightsError, is_out_of_memory
 from sgsst_core.files.atomic import file_digest, write_json
 from sgsst_core.files.formats import EXTRA_SUFFIXES, SUFFIXES, scene_path
 from sgsst_core.progress import job_bar
@@ -218,7 +218,7 @@ class StopFlag:
 
         A second Ctrl-C or SIGTERM has its usual effect. SIGHUP, which arrives when the terminal is closed, never has:
         both the shell and the system send it. Like others, it stays ignored if it is, as by `nohup`. Outside the main
-        thread, Python allows no signal handlers, so the flag stays unset.
+        thread, Python allows no signal handlers, so the flag stays unset. After a SIGHUP, this handler of it stays.
         """
         numbers = STOP_SIGNALS if threading.current_thread() is threading.main_thread() else []
         before = {number: handler for number in numbers if (handler := signal.getsignal(number)) != signal.SIG_IGN}
@@ -354,10 +354,13 @@ def batch(
 ) -> None:
     """Stylize several scenes in each of several styles; what is done already is not repeated.
 
-    With --url, a service makes the results. Exit with 1 if any could not be made.
+    With --url, a service makes the results, with a --rank-timeout and --checkpoint-seconds of its own. Exit with 1 if
+    any could not be made.
     """
     from api.client.client import different_names
 
+    if url is None and key is not None:
+        raise SettingsError("--key requires --url. Add it, or omit --key.")
     results = _Batch(out)
     jobs = {}
     named = (zip(different_names([*map(_namesake, paths)]), paths, strict=True) for paths in (scenes, style))

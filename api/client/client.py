@@ -225,8 +225,7 @@ class AsyncClient:
             except ApiError as error:
                 if error.status != 409:
                     raise
-                state = await self._transport.call("HEAD", where, headers=_TUS)
-                offset = int(state.headers["Upload-Offset"])
+                offset = int((await self._transport.call("HEAD", where, headers=_TUS)).headers["Upload-Offset"])
             progress(offset, size)
         return str(created["id"])
 
@@ -267,7 +266,7 @@ class AsyncClient:
                             event = Event(int(sent.id or 0), sent.event, json.loads(sent.data))
                             after, failures = event.id, 0
                             yield event
-            except (httpx2.RequestError, ApiError) as error:
+            except (httpx2.RequestError, ApiError, ExceptionGroup) as error:
                 # stamina cannot do this: each event resets the count of failures
                 failures += 1
                 if failures >= TRIES or not self._transport.may_pass(error):

@@ -166,7 +166,7 @@ class Transport:
 
     def unreachable(self, error: Exception) -> "ApiError":
         """Return the error for a service that did not respond."""
-        names = _given(_PROXIES)
+        names = _given(_PROXIES[:-1])
         advice = f"; {names} decides on a proxy" if names else ""
         return ApiError(
             f"{self.url} cannot be reached: {error}. Is `sgsst serve` running? --url names another address{advice}."
@@ -175,7 +175,7 @@ class Transport:
     async def _retry(self, once: Callable[[], Awaitable[T]]) -> T:
         try:
             return await self._retrying(self.may_pass, once)
-        except (httpx2.RequestError, OverflowError) as error:  # the latter for the port of a proxy
+        except (httpx2.RequestError, ExceptionGroup) as error:  # the latter for a proxy's port that cannot be
             raise self.unreachable(error) from None
 
 
@@ -324,9 +324,9 @@ def checked(response: httpx2.Response) -> httpx2.Response:
 
     Raises:
         RequestError: If the service refused the request as faulty.
-        ApiError: If the service failed, or another program redirects.
+        ApiError: If the service failed, or another program answered.
     """
-    if response.is_success:
+    if response.is_success and (not response.content or "json" in response.headers.get("content-type", "")):
         return response
     try:
         problem = response.json()
@@ -354,13 +354,12 @@ def parsed(response: httpx2.Response) -> Any:
 
 
 def _strangeness(response: httpx2.Response) -> str:
-    """Return what distinguishes a response from those of the service."""
+    """Return what distinguishes a response from those of the service; one without content may be the service's."""
     location, kind = response.headers.get("location"), response.headers.get("content-type", "no JSON")
-    what = f"redirects to {location}" if location else f"sends {kind}"
-    return (
-        f"{response.request.url} answers {response.status_code} and {what}, which the service does not. Check the "
-        "address."
-    )
+    what = f" and redirects to {location}" if response.has_redirect_location else f" and sends {kind}"
+    unlike = "" if response.is_error and not response.content else f"{what}, unlike the service"
+    advice = "Try again later, or check" if response.status_code in _TEMPORARY else "Check"
+    return f"{response.request.url} answers {response.status_code}{unlike}. {advice} the address."
 
 
 def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:

@@ -63,7 +63,11 @@ async def sign_in(
         context.sign_ins.take(address, 1 / SECONDS_A_TRY, MOST_FAILURES)
     except ServiceError as error:
         raise problems.TOO_MANY_TRIES(retry_after=error.retry_after) from None
-    key = await asyncio.to_thread(context.store.keys.find, sign_in.key)
+    try:
+        key = await asyncio.to_thread(context.store.keys.find, sign_in.key)
+    except ServiceError:
+        context.sign_ins.give_back(address)
+        raise
     if key is None:
         raise problems.UNKNOWN_KEY()
     context.sign_ins.give_back(address)

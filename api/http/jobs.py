@@ -179,8 +179,7 @@ def _sent(row: EventRow) -> _Sent:
     data = row.data
     if row.kind == "progress":  # same format as in responses that show the job
         data = {**data, "updated_at": to_jsonable_python(schemas.utc(data["updated_at"]))}
-    text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
-    return _Sent(row.id, text.encode(), _ends(row))
+    return _Sent(row.id, f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n".encode(), _ends(row))
 
 
 def _ends(row: EventRow) -> bool:

@@ -149,9 +149,8 @@ class Readiness:
     def _start(self, name: str) -> asyncio.Future[object]:
         running = self._running.get(name)
         if running is None or running.done():
-            running = asyncio.get_running_loop().run_in_executor(self._threads, self._checks[name])
-            self._running[name] = running
-        return running
+            self._running[name] = asyncio.get_running_loop().run_in_executor(self._threads, self._checks[name])
+        return self._running[name]
 
     def close(self) -> None:
         """Cancel checks that have not started, without waiting for running ones."""

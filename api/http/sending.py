@@ -414,8 +414,7 @@ def shared_page(head: str) -> bytes:
 
 
 def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Response:
-    accepted = _GZIP.search(request.headers.get("accept-encoding", ""))
-    compressed = file.compressed if accepted else None
+    compressed = file.compressed if _GZIP.search(request.headers.get("accept-encoding", "")) else None
     tag = f'"{file.digest}-gzip"' if compressed is not None else f'"{file.digest}"'
     response_headers = {
         "ETag": tag,

@@ -682,8 +682,7 @@ _Parts = tuple[receiving.Received, JobParameters, Webhook]
 
 async def _from_form(request: Request, context: Context, receipt: receiving.Receipt) -> _Parts:
     received = await receiving.receive(request, context.blobs, context.settings, receipt, context.threads)
-    text = received.texts.get("parameters", "").strip() or "{}"
-    values = receiving.parse_json(text, "parameters")
+    values = receiving.parse_json(received.texts.get("parameters", "").strip() or "{}", "parameters")
     if not isinstance(values, dict):
         raise problems.INVALID_REQUEST("parameters: is not a JSON object.", input="parameters")
     parameters = JobParameters.model_validate(values)

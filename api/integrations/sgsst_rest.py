@@ -155,8 +155,7 @@ class Service:
         if body is not None and not hasattr(body, "read"):
             data, headers["Content-Type"] = json.dumps(body).encode(), "application/json"
         try:
-            request = urllib.request.Request(self.url + path, data, headers, method=method)
-            return self._open(request, timeout=_PATIENCE)
+            return self._open(urllib.request.Request(self.url + path, data, headers, method=method), timeout=_PATIENCE)
         except urllib.error.HTTPError as error:
             raise ServiceError(self._reason(error)) from error
         except (OSError, http.client.HTTPException) as error:
@@ -242,7 +241,7 @@ class BackgroundJob(threading.Thread):
     ) -> None:
         super().__init__(daemon=True)
         if not style.is_file():
-            raise ValueError(f"There is no painting {str(style)!r}. Choose an image file.")
+            raise ValueError(f"There is no style image {str(style)!r}. Choose a file.")
         self._folder = tempfile.TemporaryDirectory()
         self._scene, self.out = (Path(self._folder.name) / name for name in ("splat.ply", "stylized.ply"))
         write_splat(self._scene, columns)

@@ -33,8 +33,7 @@ def _real_count(splat: Any) -> int:
 
 def _with_colors(splat: Any, sh: torch.Tensor) -> Any:
     """Return a single splat with other spherical harmonics, [1, N, K, 3]."""
-    n = sh.shape[1]
-    parts = [each[:, :n] for each in (splat.positions, splat.scales, splat.rotations, splat.opacities)]
+    parts = [each[:, : sh.shape[1]] for each in (splat.positions, splat.scales, splat.rotations, splat.opacities)]
     return Types.SPLAT(*parts, sh)
 
 

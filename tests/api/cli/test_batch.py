@@ -77,6 +77,11 @@ def test_missing_scenes_and_foreign_records_are_named(arguments: list[str], tmp_
     assert record.read_text() == "[1]"
 
 
+def test_key_without_a_service_is_refused(arguments: list[str], tmp_path: Path, sgsst: Sgsst) -> None:
+    assert "--key requires --url." in sgsst([*arguments, "--key", "secret"], 2)
+    assert not (tmp_path / "out").exists()
+
+
 def test_results_have_different_names(tmp_path: Path, sgsst: Sgsst) -> None:
     for name in ("a.ply", "a_b.ply", "b_c.png", "c.png"):
         (tmp_path / name).write_bytes(b"neither scene nor image")

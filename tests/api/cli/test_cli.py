@@ -819,6 +819,13 @@ def test_commands_for_files_name_a_url_unchanged(arguments: list[str], sgsst: Sg
     assert f"{url}: only `sgsst submit` takes URLs" in sgsst([each.format(url=url) for each in arguments], 2)
 
 
+def test_sheet_of_a_plan_replaces_no_photo(tmp_path: Path, sgsst: Sgsst) -> None:
+    (tmp_path / "photos").mkdir()
+    inputs = ["no.ply", "--style", "no.png", "--cameras", "no.json", "--images", str(tmp_path / "photos")]
+    sheet = tmp_path / "photos" / "a.jpg"
+    assert f"{sheet}: is among the photos or masks." in sgsst(["plan", *inputs, "--sheet", str(sheet)], 2)
+
+
 # --- check ---------------------------------------------------------------------------------------------------------
 
 

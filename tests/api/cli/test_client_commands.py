@@ -16,7 +16,7 @@ from PIL import Image
 
 from api.cli.main import main
 from api.client import Client
-from api.client.transport import RequestError
+from api.client.transport import ApiError, RequestError
 from service.states import JobStatus
 from service.store.tables import JobRow
 from tests.api.conftest import Sgsst
@@ -286,6 +286,12 @@ def test_environment_that_cannot_be_used_is_reported(
         Client()
 
 
+def test_proxy_with_a_port_that_cannot_be_is_named(sgsst: Sgsst, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:65536")
+    for command in (["jobs"], ["watch", MISSING]):
+        assert "http_proxy decides on a proxy." in sgsst([*command, "--url", "http://service.example"], 1)
+
+
 def test_variable_of_the_proxy_is_named_if_the_service_cannot_be_reached(
     sgsst: Sgsst, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -356,8 +362,11 @@ def test_address_of_another_program_is_reported(sgsst: Sgsst) -> None:
             ("/empty", "200 and sends no JSON"),
         ):
             for command in (["status", MISSING], ["jobs"], ["download", MISSING], ["watch", MISSING]):
-                assert f" answers {what}, which the service does not. Check the address." in sgsst(
+                assert f" answers {what}, unlike the service. Check the address." in sgsst(
                     [*command, "--url", server.origin + path], 1
                 )
-        assert "redirects to https://new.example/" in sgsst(["delete", MISSING, "--url", f"{server.origin}/moved"], 1)
+        for path, what in (("", "sends text/html"), ("/moved", "redirects to https://new.example/")):
+            assert what in sgsst(["delete", MISSING, "--url", server.origin + path], 1)
+        with Client(server.origin) as client, pytest.raises(ApiError, match="sends text/html, unlike the service"):
+            list(client.watch(MISSING))
         server.shutdown()
