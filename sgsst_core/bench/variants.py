@@ -427,8 +427,7 @@ def compare_quality(
         assert judgment is not None
         return VariantResult(name, what, sh_dc, judgment, moment.short, moment.long)
 
-    blend_weights = stylizer.job.plan.survey.total_blend_weights
-    transferred = warm_start(scene.sh_dc, blend_weights, Style.of(style))
+    transferred = warm_start(scene.sh_dc, stylizer.job.plan.survey.total_blend_weights, Style.of(style))
     outcomes = [
         outcome(UNSTYLIZED, "the unstylized scene", scene.sh_dc),
         outcome(TRANSFER, "the style's distribution of colors, no step", transferred),

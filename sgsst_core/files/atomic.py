@@ -72,10 +72,10 @@ def replace(temporary: Path, final: Path) -> None:
             return
         except PermissionError as error:
             if time.monotonic() > deadline:
-                kept = temporary.rename(final.with_name(f"{final.stem}-{secrets.token_hex(3)}.new{final.suffix}"))
+                new = temporary.rename(final.with_name(f"{final.stem}-{secrets.token_hex(3)}.new{final.suffix}"))
                 raise HeldOpenError(
                     f"{final}: cannot be replaced: {error.strerror}. Another program may have it open. Nothing is "
-                    f"lost: the new file is {kept}."
+                    f"lost: the new file is {new}."
                 ) from error
         time.sleep(0.1)
 

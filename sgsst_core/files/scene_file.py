@@ -14,6 +14,7 @@ import importlib.util
 import io
 import itertools
 import math
+import os
 import re
 import shutil
 import tempfile
@@ -32,7 +33,7 @@ from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import OutputError, SceneError, SettingsError, reading_scene
-from sgsst_core.files.atomic import atomic_path, ensure_writable_folder
+from sgsst_core.files.atomic import DISK_FULL, atomic_path, ensure_writable_folder
 from sgsst_core.files.formats import read_scene_header, scene_format, scene_path
 from sgsst_core.files.formats.ply import (
     FILTER_3D,
@@ -828,6 +829,9 @@ def write_usd(path: Path, scene: Scene) -> None:
         try:
             written = stage.GetRootLayer().Export(str(temporary))
         except Tf.ErrorException as error:
+            full = next((code for code in DISK_FULL if os.strerror(code) in str(error)), None)
+            if full:  # reported by `atomic_path`
+                raise OSError(full, os.strerror(full)) from error
             raise OutputError(f"{path}: cannot be written: {error}. Free some space, or name another file.") from error
         if not written:
             raise OutputError(f"{path}: cannot be written. Free some space, or name another file.")

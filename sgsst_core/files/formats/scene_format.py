@@ -471,8 +471,7 @@ class Frame:
             if self.scale != 1:
                 block["scales"] += np.float32(np.log(self.scale))
             block["quats"][:] = block["quats"].astype(np.float64) @ turn.T
-            rest = block["sh_rest"].astype(np.float64)
-            block["sh_rest"][:] = np.einsum("ij,njc->nic", harmonics, rest)
+            block["sh_rest"][:] = np.einsum("ij,njc->nic", harmonics, block["sh_rest"].astype(np.float64))
 
 
 def harmonics_matrix(rotation: NDArray[np.float64], coefficients: int) -> NDArray[np.float64]:

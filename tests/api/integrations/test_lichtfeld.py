@@ -138,7 +138,7 @@ def test_canceling_restores_the_colors(
 @pytest.mark.parametrize(
     ("selected", "changed", "message"),
     [
-        ("Splat", {"painting": "missing.jpg"}, "There is no painting 'missing.jpg'. Choose an image file."),
+        ("Splat", {"painting": "missing.jpg"}, "There is no style image 'missing.jpg'. Choose a file."),
         ("", {}, "Select a splat in the scene tree."),
         ("Camera", {}, "Camera is no splat. Select one."),
         ("Splat", {}, "No service answers at http://127.0.0.1:9."),
